@@ -1,0 +1,624 @@
+"""Every setting of a run, with the paper's value as default unless a docstring says otherwise.
+
+Sections are frozen dataclasses; a wrong value raises ``ValueError`` that names the field and the fix. The whole tree is
+written to ``config.json`` and read back strictly: an unknown key is an error, never ignored.
+"""
+
+import dataclasses
+import difflib
+import hashlib
+import json
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+STATE_FIELD_DIMS: dict[str, int] = {
+    "qpos": 9,
+    "qvel": 9,
+    "tcp_pose": 7,
+    "tcp_twist": 6,
+    "goal": 3,
+    "is_grasped": 1,
+    "target_pose": 7,
+    "tcp_to_goal": 3,
+    "object_poses": 7,
+    "object_pose": 7,
+    "tcp_to_object": 3,
+    "object_to_goal": 3,
+}
+"""Size of each field of the proprioceptive vector; ``object_poses`` counts once per object of the task."""
+
+PRIVILEGED_FIELDS = frozenset({"object_poses", "object_pose", "tcp_to_object", "object_to_goal"})
+"""Fields that read the simulator's object poses: only the validation variant ``oracle_state`` uses them."""
+
+PROPRIO_FIELDS = ("qpos", "qvel", "tcp_pose", "tcp_twist", "goal", "is_grasped")
+
+
+def check(ok: bool, name: str, value: object, want: str) -> None:
+    """Raise ``ValueError`` naming the field, its value and what it should be."""
+    if not ok:
+        raise ValueError(f"{name} = {value!r}: {want}")
+
+
+def _positive(section: str, obj: Any, *names: str) -> None:
+    for name in names:
+        value = getattr(obj, name)
+        check(value > 0, f"{section}.{name}", value, "must be greater than 0")
+
+
+def _not_negative(section: str, obj: Any, *names: str) -> None:
+    for name in names:
+        value = getattr(obj, name)
+        check(value >= 0, f"{section}.{name}", value, "must be 0 or more")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class EnvConfig:
+    """The simulated task and its wrist camera (Table 1, Table A4)."""
+
+    task: str = "PickBanana-v1"
+    """Task to learn; `slotfilm variants --tasks` lists those that are described."""
+    assets: Literal["procedural", "ycb"] = "procedural"
+    """Object meshes: generated here, or ManiSkill's downloaded YCB banana and bowl."""
+    goal: Literal["near_bowl", "fixed", "random"] = "near_bowl"
+    """Where the target point is placed: beside and above the bowl, at one fixed point, or anywhere above the table."""
+    goal_visible: bool = False
+    """Draw the green target in the wrist camera's picture (ManiSkill hides goal markers from sensors)."""
+    control_mode: str = "pd_ee_delta_pose"
+    """ManiSkill controller; the paper's 7-D action is an end-effector pose delta plus the gripper."""
+    max_steps: int = 400
+    """Length of an episode in control steps; reaching it is a truncation, never a termination."""
+    terminate_on_success: bool = False
+    """End the episode at the first success; the paper's episodes always run their full length."""
+    image_size: int = 128
+    """Height and width of the wrist camera's picture in pixels; a multiple of 16."""
+    fov_deg: float = 90.0
+    """Field of view of the pinhole camera in degrees."""
+    near_m: float = 0.01
+    """Near clipping plane in metres."""
+    far_m: float = 100.0
+    """Far clipping plane in metres."""
+    render_profile: Literal["wrist", "full"] = "wrist"
+    """`wrist` leaves out triangles that the wrist camera cannot see; `full` draws ManiSkill's whole robot."""
+    render_backend: Literal["auto", "cpu", "gpu"] = "auto"
+    """Device that renders: `auto` takes a GPU where there is one, else the software driver."""
+    sim_backend: Literal["cpu", "gpu"] = "cpu"
+    """PhysX on the CPU (one environment a process) or on a GPU (needs SAPIEN's PhysX GPU library)."""
+    occlusion: bool = False
+    """Count an object hidden behind another one as not visible (needs a segmentation render)."""
+
+    def __post_init__(self) -> None:
+        _positive("env", self, "max_steps", "near_m")
+        check(
+            self.image_size >= 32 and self.image_size % 16 == 0,
+            "env.image_size",
+            self.image_size,
+            "must be a multiple of 16, at least 32",
+        )
+        check(1 < self.fov_deg < 170, "env.fov_deg", self.fov_deg, "is in degrees and must lie between 1 and 170")
+        check(self.far_m > self.near_m, "env.far_m", self.far_m, f"must be greater than env.near_m = {self.near_m}")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ObsConfig:
+    """What the agent observes beside the picture."""
+
+    state_fields: tuple[str, ...] = PROPRIO_FIELDS
+    """Fields of the proprioceptive vector, in order. The paper's 35 dimensions leave 10 unexplained; see the README."""
+    state_dim: int = 35
+    """Total size of the fields; checked, so that a change of fields is a deliberate one."""
+    num_objects: int = 2
+    """Objects whose projected positions supervise the slots; set by the task."""
+    normalize_state: bool = False
+    """Standardise the state with mean and deviation of the random-policy data (the paper does not)."""
+
+    def __post_init__(self) -> None:
+        _positive("obs", self, "num_objects")
+        for name in self.state_fields:
+            if name not in STATE_FIELD_DIMS:
+                near = difflib.get_close_matches(name, STATE_FIELD_DIMS, n=1)
+                raise ValueError(
+                    f"obs.state_fields: unknown field {name!r}"
+                    + (f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(STATE_FIELD_DIMS)}")
+                )
+        total = sum(self.field_dim(name) for name in self.state_fields)
+        check(
+            total == self.state_dim,
+            "obs.state_dim",
+            self.state_dim,
+            f"the fields {', '.join(self.state_fields)} add up to {total}; set obs.state_dim to {total} if that is meant",
+        )
+
+    def field_dim(self, name: str) -> int:
+        """Size of one field for this task's number of objects."""
+        return STATE_FIELD_DIMS[name] * (self.num_objects if name == "object_poses" else 1)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RewardWeights:
+    """Weights of the reward's components; the paper gives none. Table 2's late phase suggests place = 2 reach."""
+
+    reach: float = 1.0
+    """Weight of the reaching term."""
+    grasp: float = 1.0
+    """Weight of the binary grasp term."""
+    place: float = 2.0
+    """Weight of the placing term."""
+    post_grasp: float = 1.0
+    """Weight of the transport term."""
+    static: float = 1.0
+    """Weight of the stability term; 0 removes it (Figure 12)."""
+
+    def __post_init__(self) -> None:
+        _not_negative("reward.weights", self, "reach", "grasp", "place", "post_grasp", "static")
+        check(self.total > 0, "reward.weights", self, "at least one weight must be greater than 0")
+
+    @property
+    def total(self) -> float:
+        """Sum of the weights, the divisor of `reward.normalize = sum`."""
+        return self.reach + self.grasp + self.place + self.post_grasp + self.static
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RewardConfig:
+    """The multiscale shaped reward (Section 4.5)."""
+
+    alpha: float = 10.0
+    """Decay of the exponential distance terms in 1/m (Figure 13 varies it, or the reward scale; see `sac.reward_scale`)."""
+    varpi: float = 5.0
+    """Sharpness of the stability term in s/rad (Figure 11)."""
+    delta_m: float = 0.025
+    """Distance below which reach and place switch to the near form, and the radius of the target region, in metres."""
+    near_form: Literal["bounded", "inverse", "exp_only"] = "bounded"
+    """Near form: 1/(1+d+eps), the printed 1/(d+eps) capped at `near_cap`, or the exponential everywhere."""
+    near_cap: float = 10.0
+    """Cap of the `inverse` near form."""
+    eps: float = 1e-5
+    """Small constant of the near form."""
+    pg_form: Literal["one_minus_exp", "exp", "exp_alpha"] = "one_minus_exp"
+    """Post-grasp form: (1 - exp(-alpha d)), the printed exp(-d), or exp(-alpha d); times grasp."""
+    place_gate: Literal["grasp", "none"] = "grasp"
+    """Placing counts only while grasped (as written), or always."""
+    static_norm: Literal["l2", "max"] = "l2"
+    """Norm of the joint velocities in the stability term."""
+    static_joints: Literal["arm", "all"] = "arm"
+    """Joints whose velocity counts: the 7 of the arm, or the fingers too."""
+    weights: RewardWeights = field(default_factory=RewardWeights)
+    """Weights of the components."""
+    normalize: Literal["sum", "none"] = "sum"
+    """Divide by the sum of the weights, so that a step's reward lies in [0, 1] with the bounded form, or not."""
+
+    def __post_init__(self) -> None:
+        _positive("reward", self, "alpha", "varpi", "delta_m", "near_cap", "eps")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SuccessConfig:
+    """When an episode counts as solved."""
+
+    require_static: bool = True
+    """The arm must stand still (every arm joint below `static_threshold`), as ManiSkill asks."""
+    static_threshold: float = 0.2
+    """Largest arm joint velocity that counts as still, in rad/s."""
+    require_release: bool = False
+    """The gripper must have let go; the paper's Figure 8 ends holding."""
+
+    def __post_init__(self) -> None:
+        _positive("success", self, "static_threshold")
+
+
+Fusion = Literal["film_tanh", "film_clamp", "concat_proj", "concat_late", "none", "state_only"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class EncoderConfig:
+    """The fusion encoder (Sections 4.1 and 4.2)."""
+
+    backbone: Literal["imagenet", "path", "random"] = "imagenet"
+    """Initial ResNet-18 weights: torchvision's ImageNet download, a file, or random. Never falls back silently."""
+    backbone_path: str = ""
+    """File of ResNet-18 weights (.safetensors, or a torch state dict loaded with weights_only) for `backbone = path`."""
+    feature_dim: int = 42
+    """Channels D of tokens, slots and FiLM."""
+    num_heads: int = 3
+    """Cross-attention heads; must divide `feature_dim`."""
+    num_slots: int = 2
+    """Learnable slot queries N_s."""
+    pos_scale: float = 0.05
+    """Lambda, the weight of the positional code."""
+    slot_normalize: Literal["tokens", "slots"] = "tokens"
+    """Softmax over tokens (the paper's mathematics) or over slots (slots compete, renormalised over tokens)."""
+    fusion: Fusion = "film_tanh"
+    """How the state enters; see `slotfilm variants`."""
+    goal: bool = False
+    """Add the goal query and its two-way gate."""
+    goal_out_of_view_bias: float = -1e4
+    """Bias of the goal's gate logit while the goal is out of view."""
+    head_hidden: int = 256
+    """Hidden width of the UV and visibility heads."""
+    vis_head: Literal["pooled", "matched"] = "pooled"
+    """Visibility from the pooled slots, one logit per object; or one logit per slot, matched like the positions."""
+
+    def __post_init__(self) -> None:
+        _positive("encoder", self, "feature_dim", "num_heads", "num_slots", "head_hidden")
+        check(
+            self.feature_dim % self.num_heads == 0,
+            "encoder.num_heads",
+            self.num_heads,
+            f"must divide encoder.feature_dim = {self.feature_dim}",
+        )
+        check(
+            self.feature_dim % 2 == 0,
+            "encoder.feature_dim",
+            self.feature_dim,
+            "must be even: half codes the row, half the column",
+        )
+        check(
+            self.backbone != "path" or bool(self.backbone_path),
+            "encoder.backbone_path",
+            self.backbone_path,
+            "encoder.backbone = 'path' needs a file",
+        )
+
+    @property
+    def uses_image(self) -> bool:
+        """Whether the agent sees the camera at all."""
+        return self.fusion != "state_only"
+
+    @property
+    def uses_state(self) -> bool:
+        """Whether the state reaches the latent."""
+        return self.fusion != "none"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PretrainConfig:
+    """Supervised slot pre-training (Section 4.3)."""
+
+    steps: int = 150_000
+    """Gradient steps; 0 skips pre-training."""
+    batch_size: int = 128
+    """Frames per gradient step."""
+    lr: float = 1e-4
+    """Adam learning rate."""
+    lambda_pos: float = 1.0
+    """Weight of the position loss (the paper gives none of the three)."""
+    lambda_vis: float = 1.0
+    """Weight of the visibility loss."""
+    lambda_attn: float = 1.0
+    """Weight of the attention alignment loss."""
+    attn_reduce: Literal["sum_clamped", "sum", "mean"] = "sum_clamped"
+    """How the slots' attention at an object's token is combined; the printed sum can exceed 1, so it is clamped."""
+    uv_units: Literal["unit", "pixels"] = "unit"
+    """Position errors in [0, 1] image units, or in pixels."""
+    train_backbone: Literal["all", "none"] = "all"
+    """Train the whole ResNet, as the paper does, or keep it as initialised and learn on its cached features."""
+    holdout: float = 0.1
+    """Share of the episodes' frames held out for the reported errors."""
+    eval_every: int = 500
+    """Steps between evaluations on held-out frames."""
+
+    def __post_init__(self) -> None:
+        _not_negative("pretrain", self, "steps", "lambda_pos", "lambda_vis", "lambda_attn")
+        _positive("pretrain", self, "batch_size", "lr", "eval_every")
+        check(0 < self.holdout < 1, "pretrain.holdout", self.holdout, "is a share and must lie between 0 and 1")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LrConfig:
+    """Adam learning rates during RL (Table A1)."""
+
+    actor: float = 1e-4
+    """Actor (the table's `alpha`)."""
+    critic_value: float = 1e-3
+    """Critics and value network (the table's `beta`)."""
+    fusion: float = 1e-4
+    """Slot attention and FiLM."""
+    goal_gate: float = 3e-5
+    """Goal gate logits."""
+    temperature: float = 3e-4
+    """Temperature, when `sac.temperature_mode = auto`."""
+    backbone: float = 1e-4
+    """Backbone and projection, when they are trained end to end."""
+
+    def __post_init__(self) -> None:
+        _positive("lr", self, *(f.name for f in dataclasses.fields(self)))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SacConfig:
+    """Soft Actor-Critic with a value network (Section 4.4, Table A1)."""
+
+    gamma: float = 0.99
+    """Discount factor."""
+    tau: float = 0.005
+    """Polyak rate of the target value network."""
+    hidden: tuple[int, ...] = (256, 256)
+    """Hidden layers of actor, critics and value network."""
+    batch_size: int = 128
+    """Transitions per update."""
+    reward_scale: float = 10.0
+    """Multiplies the reward in the critic's target; scale 10 with temperature 1 equals scale 1 with temperature 0.1."""
+    temperature_mode: Literal["fixed", "auto"] = "fixed"
+    """Keep the temperature, or tune it to `target_entropy`."""
+    temperature: float = 1.0
+    """Entropy temperature, or its starting value; the paper names no value."""
+    target_entropy: float = -7.0
+    """Target entropy of `auto`, in nats; minus the action dimensions by default."""
+    log_std_min: float = -5.0
+    """Lower clamp of the policy's log standard deviation."""
+    log_std_max: float = 2.0
+    """Upper clamp of the policy's log standard deviation."""
+    critic_norm: Literal["none", "layer"] = "none"
+    """LayerNorm in the critics and the value network; keeps them from diverging (not in the paper)."""
+    bootstrap: Literal["on_truncation", "always", "never"] = "on_truncation"
+    """Bootstrap through time limits only, also through terminations, or through neither."""
+    grad_clip: float = 0.0
+    """Largest gradient norm of the critics and the encoder; 0 leaves gradients alone."""
+    train_heads: bool = False
+    """Also train the UV and visibility heads in RL (the critic's loss gives them no gradient)."""
+    end_to_end: bool = False
+    """Train backbone and projection through the critic's loss and keep images in replay (Section 7.4)."""
+
+    def __post_init__(self) -> None:
+        check(0 <= self.gamma < 1, "sac.gamma", self.gamma, "must lie in [0, 1)")
+        check(0 < self.tau <= 1, "sac.tau", self.tau, "must lie in (0, 1]")
+        check(
+            len(self.hidden) > 0 and all(h > 0 for h in self.hidden),
+            "sac.hidden",
+            self.hidden,
+            "needs at least one layer, each wider than 0",
+        )
+        _positive("sac", self, "batch_size", "reward_scale", "temperature")
+        _not_negative("sac", self, "grad_clip")
+        check(
+            self.log_std_min < self.log_std_max,
+            "sac.log_std_min",
+            self.log_std_min,
+            f"must be below sac.log_std_max = {self.log_std_max}",
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ReplayConfig:
+    """The replay buffer."""
+
+    capacity: int = 1_000_000
+    """Steps kept, over all shards; the oldest go first."""
+    num_shards: int = 1
+    """Shards, each a process of its own on a cluster."""
+    min_steps: int = 1_000
+    """Steps that must be stored before the first update."""
+
+    def __post_init__(self) -> None:
+        _positive("replay", self, "capacity", "num_shards", "min_steps")
+        check(
+            self.min_steps <= self.capacity,
+            "replay.min_steps",
+            self.min_steps,
+            f"must not exceed replay.capacity = {self.capacity}",
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ScheduleConfig:
+    """How long each phase lasts."""
+
+    total_steps: int = 1_200_000
+    """Environment steps over all phases: 3000 epochs of 400."""
+    random_steps: int = 100_000
+    """Steps of the random policy before any learning; also the pre-training data."""
+    updates_per_step: float = 1.0
+    """Optimiser updates per environment step once learning has begun."""
+
+    def __post_init__(self) -> None:
+        _positive("schedule", self, "total_steps", "random_steps", "updates_per_step")
+        check(
+            self.random_steps <= self.total_steps,
+            "schedule.random_steps",
+            self.random_steps,
+            f"must not exceed schedule.total_steps = {self.total_steps}",
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class EvaluationConfig:
+    """Deterministic evaluation on seeds that training never sees."""
+
+    episodes: int = 50
+    """Episodes of the final evaluation."""
+    every_steps: int = 50_000
+    """Environment steps between evaluations during training; 0 evaluates only at the end."""
+    during_episodes: int = 10
+    """Episodes of each evaluation during training."""
+    seed: int = 10_000_000
+    """First seed of the held-out range; training seeds stay below it."""
+    videos: int = 2
+    """Episodes recorded as video with the slots' attention drawn on them."""
+
+    def __post_init__(self) -> None:
+        _positive("evaluation", self, "episodes", "during_episodes")
+        _not_negative("evaluation", self, "every_steps", "videos")
+        check(
+            self.seed >= 10_000_000,
+            "evaluation.seed",
+            self.seed,
+            "must be 10000000 or more, so that no training episode shares it",
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RuntimeConfig:
+    """Where the roles run."""
+
+    mode: Literal["local", "ray"] = "ray"
+    """`local` runs every role in one process, bit-reproducibly; `ray` spreads them over processes and machines."""
+    num_workers: int = 2
+    """Environment workers (`ray` mode)."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Device of the learner; `auto` takes a GPU where there is one."""
+    learner_threads: int = 0
+    """Torch threads of the learner on a CPU; 0 takes half of the cores."""
+    worker_threads: int = 1
+    """Torch threads of an environment worker."""
+    block_steps: int = 32
+    """Steps a worker collects before it sends them."""
+    publish_every: int = 50
+    """Updates between weight snapshots."""
+
+    def __post_init__(self) -> None:
+        _positive("runtime", self, "num_workers", "worker_threads", "block_steps", "publish_every")
+        _not_negative("runtime", self, "learner_threads")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CheckpointConfig:
+    """Checkpoints of the learner."""
+
+    every_updates: int = 10_000
+    """Updates between checkpoints."""
+    keep: int = 2
+    """Checkpoints kept beside `best`."""
+    save_replay: bool = True
+    """Also write the replay buffer at the end and on Ctrl-C, so that a resumed run continues with its data."""
+
+    def __post_init__(self) -> None:
+        _positive("checkpoint", self, "every_updates", "keep")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RunConfig:
+    """One run: what is learned, how, for how long and where."""
+
+    variant: str = "slotfilm"
+    """Agent to train; `slotfilm variants` lists them."""
+    seed: int = 0
+    """Root of every random stream of the run."""
+    env: EnvConfig = field(default_factory=EnvConfig)
+    """Task and camera."""
+    obs: ObsConfig = field(default_factory=ObsConfig)
+    """State vector."""
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    """Reward of PickBanana; other tasks bring their own."""
+    success: SuccessConfig = field(default_factory=SuccessConfig)
+    """Success of PickBanana; other tasks bring their own."""
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    """Encoder."""
+    pretrain: PretrainConfig = field(default_factory=PretrainConfig)
+    """Pre-training."""
+    sac: SacConfig = field(default_factory=SacConfig)
+    """Reinforcement learning."""
+    lr: LrConfig = field(default_factory=LrConfig)
+    """Learning rates."""
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    """Replay buffer."""
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    """Lengths of the phases."""
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    """Evaluation."""
+    runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
+    """Processes and devices."""
+    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+    """Checkpoints."""
+
+    def __post_init__(self) -> None:
+        check(0 <= self.seed < 2**31, "seed", self.seed, "must lie in [0, 2147483648)")
+        check(
+            self.replay.min_steps <= self.schedule.total_steps,
+            "replay.min_steps",
+            self.replay.min_steps,
+            f"must not exceed schedule.total_steps = {self.schedule.total_steps}, or no update ever happens",
+        )
+        check(
+            self.encoder.num_slots >= self.obs.num_objects or not self.encoder.uses_image or self.pretrain.steps == 0,
+            "encoder.num_slots",
+            self.encoder.num_slots,
+            f"pre-training matches every object to a slot of its own and needs at least obs.num_objects = {self.obs.num_objects}",
+        )
+
+
+ConfigT = TypeVar("ConfigT")
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """The config as plain dicts, lists and scalars, ready for JSON."""
+    return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def from_dict(cls: type[ConfigT], values: dict[str, Any], where: str = "") -> ConfigT:
+    """Build a config section from plain values.
+
+    Raises:
+        ValueError: an unknown key (with the nearest known one), a value of the wrong type, or an impossible value.
+    """
+    known = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]  # cls is a dataclass by contract
+    hints = typing.get_type_hints(cls)
+    kwargs: dict[str, Any] = {}
+    for key, value in values.items():
+        path = f"{where}{key}"
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1)
+            raise ValueError(f"unknown field {path!r}" + (f"; did you mean {where + near[0]!r}?" if near else ""))
+        kwargs[key] = _coerce(hints[key], value, path)
+    return cls(**kwargs)
+
+
+def _coerce(kind: Any, value: Any, path: str) -> Any:
+    if dataclasses.is_dataclass(kind):
+        check(isinstance(value, dict), path, value, "must be a section of fields")
+        return from_dict(typing.cast(type, kind), value, path + ".")
+    origin = typing.get_origin(kind)
+    if origin is Literal:
+        choices = typing.get_args(kind)
+        check(value in choices, path, value, f"must be one of {', '.join(map(str, choices))}")
+        return value
+    if origin is tuple:
+        check(isinstance(value, list | tuple), path, value, "must be a list")
+        return tuple(_coerce(typing.get_args(kind)[0], item, path) for item in value)
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    check(
+        isinstance(value, kind) and (kind is bool or not isinstance(value, bool)),
+        path,
+        value,
+        f"must be {'an' if kind is int else 'a'} {getattr(kind, '__name__', kind)}",
+    )
+    return value
+
+
+def save_config(config: RunConfig, path: Path) -> None:
+    """Write the whole config as JSON."""
+    path.write_text(json.dumps(to_dict(config), indent=2) + "\n", encoding="utf-8")
+
+
+def load_config(path: Path) -> RunConfig:
+    """Read a config written by `save_config`; raises ``ValueError`` naming the file and the field."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ValueError(f"{path} does not exist; a run directory has a config.json") from None
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} is not valid JSON: {error}") from None
+    try:
+        return from_dict(RunConfig, values)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def config_hash(*sections: Any) -> str:
+    """First 16 hex digits of SHA-256 over the sections' JSON; names artifacts and checks checkpoints."""
+    plain = [to_dict(s) if dataclasses.is_dataclass(s) else s for s in sections]
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def changed_fields(base: Any, other: Any, where: str = "") -> dict[str, tuple[Any, Any]]:
+    """Dotted names of the fields that differ, each with (base value, other value)."""
+    out: dict[str, tuple[Any, Any]] = {}
+    for f in dataclasses.fields(base):
+        a, b = getattr(base, f.name), getattr(other, f.name)
+        if dataclasses.is_dataclass(a) and not isinstance(a, type):
+            out |= changed_fields(a, b, f"{where}{f.name}.")
+        elif a != b:
+            out[where + f.name] = (a, b)
+    return out
