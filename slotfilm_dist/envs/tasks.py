@@ -1,0 +1,70 @@
+"""What the system needs to know of a task. A new ManiSkill task with a Panda's wrist camera is one entry here."""
+
+import dataclasses
+import difflib
+from dataclasses import dataclass
+
+from slotfilm_dist.config import RunConfig, check
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Task:
+    """A ManiSkill task seen through the wrist camera of a Panda."""
+
+    env_id: str
+    """ManiSkill's name of the environment."""
+    objects: tuple[str, ...]
+    """Attributes of the environment that hold the tracked actors; the first is to be grasped. They supervise the slots."""
+    goal: str
+    """Attribute that holds the goal's actor; empty for none (its state fields then read zero)."""
+    max_steps: int
+    """Length of an episode in control steps."""
+    robot: str = "panda_wristcam"
+    """ManiSkill's name of the robot."""
+    own_reward: bool = False
+    """The task takes the `reward` and `success` sections; others bring ManiSkill's normalised dense reward and success."""
+
+
+TASKS: dict[str, Task] = {
+    "PickBanana-v1": Task(
+        env_id="PickBanana-v1",
+        objects=("banana", "bowl"),
+        goal="goal_site",
+        max_steps=400,
+        robot="panda_wristcam_direct",
+        own_reward=True,
+    ),
+    "PickCube-v1": Task(env_id="PickCube-v1", objects=("cube",), goal="goal_site", max_steps=100),
+    "StackCube-v1": Task(env_id="StackCube-v1", objects=("cubeA", "cubeB"), goal="", max_steps=100),
+}
+
+
+def task_named(name: str) -> Task:
+    """The description of a task; raises ``ValueError`` with the nearest known name."""
+    if name not in TASKS:
+        near = difflib.get_close_matches(name, TASKS, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(TASKS)}"
+        raise ValueError(f"env.task = {name!r}: no such task is described in envs/tasks.py; {hint}")
+    return TASKS[name]
+
+
+def adapt_config(config: RunConfig) -> RunConfig:
+    """The config with what follows from its task: number of objects, slots, episode length.
+
+    Values that differ from PickBanana's defaults are the user's and stay.
+    """
+    task = task_named(config.env.task)
+    num_objects = len(task.objects)
+    defaults = RunConfig()
+    env, obs, encoder = config.env, config.obs, config.encoder
+    if env.max_steps == defaults.env.max_steps:
+        env = dataclasses.replace(env, max_steps=task.max_steps)
+    if obs.num_objects != num_objects:
+        extra = sum(name == "object_poses" for name in obs.state_fields) * 7 * (num_objects - obs.num_objects)
+        obs = dataclasses.replace(obs, num_objects=num_objects, state_dim=obs.state_dim + extra)
+    if encoder.num_slots == defaults.encoder.num_slots:
+        encoder = dataclasses.replace(encoder, num_slots=max(num_objects, 1))
+    check(
+        not encoder.goal or bool(task.goal), "encoder.goal", encoder.goal, f"{task.env_id} has no goal point to query"
+    )
+    return dataclasses.replace(config, env=env, obs=obs, encoder=encoder)

@@ -1,0 +1,1 @@
+"""What a trained agent can do, what it sees and what it costs."""

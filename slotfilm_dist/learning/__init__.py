@@ -1,0 +1,1 @@
+"""Losses, the SAC learner and slot pre-training."""

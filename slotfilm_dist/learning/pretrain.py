@@ -1,0 +1,222 @@
+"""Supervised slot pre-training on frames of a random policy (Section 4.3)."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float16, Int, UInt8
+from torch import Tensor, nn
+
+from slotfilm_dist.config import PretrainConfig
+from slotfilm_dist.learning.frames import PretrainFrames, mean_position, split_by_episode
+from slotfilm_dist.learning.perception_losses import pretrain_losses
+from slotfilm_dist.learning.perception_quality import PerceptionQuality, perception_quality
+from slotfilm_dist.nets.backbone import FEATURE_CHANNELS
+from slotfilm_dist.nets.encoder import SlotFusionEncoder
+from slotfilm_dist.nets.perception import Perception
+
+_FORWARD_BATCH = 128
+_ADAM_MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+class Pretrainer:
+    """Trains an encoder's perception; FiLM and gate get no gradient, so RL starts from the exact identity.
+
+    The loop that uses it:
+
+        while pretrainer.num_steps < config.steps:
+            metrics = pretrainer.step()
+            if pretrainer.num_steps % config.eval_every == 0:
+                quality = pretrainer.evaluate()
+        pretrainer.finish()
+
+    With `pretrain.train_backbone = none` the backbone runs once over all frames, in a fixed eval mode, and its float16
+    features stay in memory (32 KB per 128 x 128 frame); every step afterwards is cheap. The batch of step i depends on
+    seed and i alone, so a resumed run draws the same batches without any saved random state.
+
+    Args:
+        encoder: trained in place; has a camera and an unfrozen backbone.
+        frames: of at least two episodes.
+        config: lengths, weights and rates.
+        seed: of the split and of the batches.
+        device: where it runs.
+        max_eval_frames: held-out frames that `evaluate` looks at, spread evenly.
+
+    Raises:
+        ValueError: fewer than two episodes, or pictures of another size than the encoder's.
+    """
+
+    def __init__(
+        self,
+        encoder: SlotFusionEncoder,
+        frames: PretrainFrames,
+        config: PretrainConfig,
+        *,
+        seed: int,
+        device: torch.device | str = "cpu",
+        max_eval_frames: int = 1024,
+    ) -> None:
+        assert encoder.perception is not None, "an encoder without a camera has nothing to pre-train"
+        assert not encoder.perception.frozen, "the backbone is frozen: it has been pre-trained already"
+        self.encoder, self.network = encoder.to(device), encoder.perception
+        self.frames, self.config, self.device = frames, config, torch.device(device)
+        self.num_steps = 0
+        """Gradient steps done."""
+        self._image_size = self.network.image_size
+        if frames.rgb.shape[1:3] != (self._image_size, self._image_size):
+            raise ValueError(f"env.image_size = {self._image_size}: the frames are {frames.rgb.shape[1:3]} pixels")
+        self._seed = seed
+        self.train_frames, held_out = split_by_episode(frames.episode, config.holdout, seed)
+        """Frames that are trained on."""
+        spread = np.linspace(0, len(held_out) - 1, min(max_eval_frames, len(held_out))).astype(np.int64)
+        self.eval_frames = held_out[spread]
+        """Frames of other episodes that `evaluate` looks at."""
+        self._mean_position = torch.from_numpy(mean_position(frames, self.train_frames)).to(self.device)
+        self._features: Float16[np.ndarray, "frames tokens channels"] | None = None
+        self._trained = self._trained_parameters()
+        self._optimizer = torch.optim.Adam(self._trained.values(), lr=config.lr, fused=True)
+
+    def step(self) -> dict[str, float]:
+        """One gradient step on a random batch of training frames; returns the losses by metric name.
+
+        Raises:
+            ValueError: the loss is no longer finite.
+        """
+        rng = np.random.default_rng([self._seed, self.num_steps])
+        chosen = np.sort(rng.choice(self.train_frames, self.config.batch_size))  # sorted: a file is read forwards
+        uv, visible = self._labels(chosen)
+        losses = pretrain_losses(
+            self._perceive(chosen, training=True),
+            uv,
+            visible,
+            self.config,
+            image_size=self._image_size,
+            matched_visibility=self.network.matched_visibility,
+        )
+        self._optimizer.zero_grad(set_to_none=True)
+        losses.total.backward()
+        parts = torch.stack((losses.total, losses.position, losses.visibility, losses.attention)).detach()
+        total, position, visibility, attention = parts.tolist()
+        if not math.isfinite(total):
+            raise ValueError(f"pre-training diverged at step {self.num_steps} (loss {total}): lower pretrain.lr")
+        self._optimizer.step()
+        self.num_steps += 1
+        return {
+            "pretrain_loss": total,
+            "pretrain_position_loss": position,
+            "pretrain_visibility_loss": visibility,
+            "pretrain_attention_loss": attention,
+        }
+
+    @torch.no_grad()
+    def evaluate(self) -> PerceptionQuality:
+        """How well frames of held-out episodes are understood; the baseline predicts the training frames' mean."""
+        parts = [self._perceive(chosen, training=False) for chosen in _batches(self.eval_frames)]
+        perception = Perception(
+            slots=torch.cat([part.slots for part in parts]),
+            attention=torch.cat([part.attention for part in parts]),
+            uv=torch.cat([part.uv for part in parts]),
+            visible_logits=torch.cat([part.visible_logits for part in parts]),
+        )
+        uv, visible = self._labels(self.eval_frames)
+        return perception_quality(
+            perception,
+            uv,
+            visible,
+            self._mean_position,
+            image_size=self._image_size,
+            matched_visibility=self.network.matched_visibility,
+        )
+
+    def finish(self) -> None:
+        """Freeze backbone and projection and leave the encoder in eval mode, ready for RL."""
+        assert self.encoder.fusion is not None
+        assert self.encoder.fusion.is_identity(), "pre-training must leave FiLM at zero"
+        self.encoder.freeze_backbone()
+        self.encoder.eval()
+
+    def save(self) -> dict[str, Any]:
+        """Weights, Adam's moments and the step, as nested dicts of arrays and scalars."""
+        moments = {
+            name: {key: _array(self._optimizer.state[parameter][key]) for key in _ADAM_MOMENTS}
+            for name, parameter in self._trained.items()
+            if parameter in self._optimizer.state
+        }
+        weights = {name: _array(value) for name, value in self.encoder.state_dict().items()}
+        return {"num_steps": self.num_steps, "seed": self._seed, "weights": weights, "adam": moments}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Continue a saved pre-training as if it had never stopped.
+
+        Raises:
+            ValueError: it was saved by another encoder, with another seed, or trained other parameters.
+        """
+        if state["seed"] != self._seed:
+            raise ValueError(f"seed = {self._seed}: the saved pre-training has seed {state['seed']}; resume with that")
+        if state["adam"] and state["adam"].keys() != self._trained.keys():
+            raise ValueError(
+                "pretrain.train_backbone: the saved pre-training trained other parameters; resume with its"
+            )
+        weights = {name: torch.from_numpy(np.array(value)) for name, value in state["weights"].items()}
+        try:
+            self.encoder.load_state_dict(weights)
+        except RuntimeError as error:
+            raise ValueError(f"the saved pre-training belongs to another encoder: {error}") from None
+        self.num_steps = int(state["num_steps"])
+        self._optimizer.state.clear()
+        for name, moments in state["adam"].items():
+            self._optimizer.state[self._trained[name]] = self._adam_state(self._trained[name], moments)
+        self._features = None
+
+    def _adam_state(self, parameter: nn.Parameter, moments: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Adam's state in the parameter's own memory layout, which its fused kernel takes for granted."""
+        state = {"step": torch.tensor(float(self.num_steps), device=self.device)}
+        for key in _ADAM_MOMENTS:
+            state[key] = torch.empty_like(parameter, requires_grad=False)
+            state[key].copy_(torch.from_numpy(np.array(moments[key])))
+        return state
+
+    def _trained_parameters(self) -> dict[str, nn.Parameter]:
+        """What is trained, by name: perception, with or without the backbone; never FiLM, gate or concatenation."""
+        with_backbone = self.config.train_backbone == "all"
+        named = dict(self.network.named_parameters())
+        return {name: value for name, value in named.items() if with_backbone or not name.startswith("backbone.")}
+
+    def _perceive(self, chosen: Int[np.ndarray, " batch"], *, training: bool) -> Perception:
+        """The network's view of some frames; with a trained backbone BatchNorm follows `training`."""
+        if self.config.train_backbone == "all":
+            self.encoder.train(training)
+            return self.network(self.network.tokens(self._pictures(chosen)))
+        features = torch.from_numpy(self._cached_features()[chosen]).to(self.device)
+        return self.network(self.network.projection(features.float()))
+
+    @torch.no_grad()
+    def _cached_features(self) -> Float16[np.ndarray, "frames tokens channels"]:
+        """The unchanging backbone's features of every frame, computed at the first call."""
+        if self._features is None:
+            self.encoder.eval()
+            num_frames, num_tokens = len(self.frames.rgb), self.network.grid_size**2
+            self._features = np.empty((num_frames, num_tokens, FEATURE_CHANNELS), np.float16)
+            for chosen in _batches(np.arange(num_frames)):
+                self._features[chosen] = self.network.backbone(self._pictures(chosen)).half().cpu().numpy()
+        return self._features
+
+    def _pictures(self, chosen: Int[np.ndarray, " batch"]) -> UInt8[Tensor, "batch height width 3"]:
+        return torch.from_numpy(np.asarray(self.frames.rgb[chosen])).to(self.device)
+
+    def _labels(
+        self, chosen: Int[np.ndarray, " batch"]
+    ) -> tuple[Float[Tensor, "batch objects 2"], Bool[Tensor, "batch objects"]]:
+        uv, visible = torch.from_numpy(self.frames.uv[chosen]), torch.from_numpy(self.frames.visible[chosen])
+        return uv.to(self.device), visible.to(self.device)
+
+
+def _batches(chosen: Int[np.ndarray, " frames"]) -> list[Int[np.ndarray, " batch"]]:
+    return np.array_split(chosen, math.ceil(len(chosen) / _FORWARD_BATCH))
+
+
+def _array(value: Tensor) -> np.ndarray:
+    """An independent copy."""
+    return value.detach().cpu().contiguous().numpy().copy()

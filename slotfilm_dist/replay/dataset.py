@@ -1,0 +1,163 @@
+"""The random policy's frames as a directory of columns, read through memory maps and shared by many trials."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int32, UInt8
+
+from slotfilm_dist.atomic import FileDigest, check_file
+from slotfilm_dist.config import check, from_dict
+from slotfilm_dist.messages import TransitionBlock
+from slotfilm_dist.replay.schema import Column, ReplaySchema
+
+MANIFEST = "manifest.json"
+PROGRESS = "progress.json"
+FORMAT = 1
+"""Version of the layout on disk."""
+
+EPISODE_COLUMN = Column(shape=(), dtype=np.dtype(np.int32))
+DATASET_WORKER_ID = -1
+"""Worker id of blocks that were read from a dataset, which no worker has."""
+
+
+def dataset_columns(schema: ReplaySchema) -> dict[str, Column]:
+    """The files of a dataset, by name without `.npy`: the schema's columns, the picture's called `rgb`, and `episode`.
+
+    Raises:
+        ValueError: the schema stores tokens, which would tie the frames to one backbone, or no labels.
+    """
+    check(schema.visual_kind != "tokens", "schema.visual_kind", schema.visual_kind, "a dataset keeps pictures")
+    check(schema.store_labels, "schema.store_labels", False, "a dataset is for pre-training, which needs the labels")
+    columns = {("rgb" if name == "visual" else name): column for name, column in schema.columns.items()}
+    return columns | {"episode": EPISODE_COLUMN}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FrameDataset:
+    """Rows laid out as in a `TransitionBlock`: a frame and, where `is_step` is set, the step taken from it.
+
+    All arrays are read-only maps of the files: index them, do not load them whole.
+    """
+
+    schema: ReplaySchema
+    """Shapes and types."""
+    config_hash: str
+    """Hash of the config fields that the frames depend on."""
+    num_steps: int
+    """Rows with a step."""
+    num_episodes: int
+    """Distinct values of `episode`."""
+    rgb: UInt8[np.ndarray, "rows *visual"]
+    """Pictures [rows, height, width, 3], or [rows, 0] without a camera."""
+    proprio: Float32[np.ndarray, "rows proprio"]
+    goal: Float32[np.ndarray, "rows 3"]
+    uv: Float32[np.ndarray, "rows objects 2"]
+    visible: Bool[np.ndarray, "rows objects"]
+    action: Float32[np.ndarray, "rows action"]
+    reward: Float32[np.ndarray, " rows"]
+    terminated: Bool[np.ndarray, " rows"]
+    truncated: Bool[np.ndarray, " rows"]
+    is_step: Bool[np.ndarray, " rows"]
+    episode: Int32[np.ndarray, " rows"]
+    """Episode of the row, from 0; rows of one episode may lie apart. Split train from test by it, not by rows."""
+
+    @property
+    def num_rows(self) -> int:
+        """Frames held; a frame between two blocks is held twice."""
+        return len(self.reward)
+
+    def blocks(self, rows: int) -> Iterator[TransitionBlock]:
+        """Everything in order, in blocks of at most `rows` rows where the layout allows, for filling replay.
+
+        Blocks end where a row holds no step, so a longer run of steps gives a longer block. Their arrays are views of
+        the files. Replace `visual` and `backbone_hash` with a backbone's tokens where replay holds those.
+        """
+        check(rows > 0, "rows", rows, "must be greater than 0")
+        ends = np.flatnonzero(~self.is_step) + 1
+        start = sequence = 0
+        while start < self.num_rows:
+            reachable = int(np.searchsorted(ends, start + rows, side="right"))
+            first = int(np.searchsorted(ends, start, side="right"))
+            end = int(ends[max(reachable - 1, first)])
+            yield self._block(slice(start, end), sequence)
+            start, sequence = end, sequence + 1
+
+    def _block(self, span: slice, sequence: int) -> TransitionBlock:
+        return TransitionBlock(
+            worker_id=DATASET_WORKER_ID,
+            incarnation=0,
+            sequence=sequence,
+            policy_version=-1,
+            backbone_hash="",
+            visual=self.rgb[span],
+            proprio=self.proprio[span],
+            goal=self.goal[span],
+            uv=self.uv[span],
+            visible=self.visible[span],
+            action=self.action[span],
+            reward=self.reward[span],
+            terminated=self.terminated[span],
+            truncated=self.truncated[span],
+            is_step=self.is_step[span],
+        )
+
+
+def open_dataset(directory: Path, expect_hash: str, *, verify: bool = True) -> FrameDataset:
+    """Open a finished dataset.
+
+    Args:
+        directory: where `FrameDatasetWriter` wrote it.
+        expect_hash: hash of the config fields it must have been made with.
+        verify: compare every file's SHA-256 (about a second per gigabyte), not only its size.
+
+    Raises:
+        ValueError: it does not exist, is unfinished, altered, or made with another config; names the file and the fix.
+    """
+    manifest = _read_manifest(directory)
+    if manifest["config_hash"] != expect_hash:
+        raise ValueError(
+            f"{directory} was made with config {manifest['config_hash']}, this run needs {expect_hash}; "
+            "collect a dataset of its own for this run"
+        )
+    schema = from_dict(ReplaySchema, manifest["schema"], "schema.")
+    arrays: dict[str, Any] = {}
+    for name, column in dataset_columns(schema).items():
+        path = directory / f"{name}.npy"
+        check_file(path, FileDigest(**manifest["files"][path.name]), content=verify)
+        arrays[name] = _open_column(path, column, manifest["num_rows"])
+    return FrameDataset(
+        schema=schema,
+        config_hash=manifest["config_hash"],
+        num_steps=manifest["num_steps"],
+        num_episodes=manifest["num_episodes"],
+        **arrays,
+    )
+
+
+def _read_manifest(directory: Path) -> dict[str, Any]:
+    path = directory / MANIFEST
+    try:
+        manifest = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        if (directory / PROGRESS).exists():
+            raise ValueError(f"{directory} is an unfinished dataset; collect again to continue it") from None
+        raise ValueError(f"{path} does not exist: {directory} is not a dataset") from None
+    except ValueError as error:
+        raise ValueError(f"{path} is corrupt: {error}; delete the directory and collect again") from None
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        raise ValueError(f"{path} is not a manifest of format {FORMAT}; delete the directory and collect again")
+    return manifest
+
+
+def _open_column(path: Path, column: Column, num_rows: int) -> np.ndarray:
+    shape = (num_rows, *column.shape)
+    if 0 in shape:
+        return np.empty(shape, column.dtype)  # an empty file cannot be mapped
+    array = np.load(path, mmap_mode="r", allow_pickle=False)
+    if array.shape != shape or array.dtype != column.dtype:
+        raise ValueError(f"{path} holds {array.dtype} {array.shape}, the manifest says {column.dtype} {shape}")
+    return array

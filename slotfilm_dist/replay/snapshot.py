@@ -1,0 +1,135 @@
+"""A shard's state on disk: written in pieces, complete or not there, and checked before it is used.
+
+A directory holds one file for each large array, one for everything else and `manifest.json`, which names them with
+their SHA-256. The manifest is renamed into place last; until then the old one and its files stay readable.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slotfilm_dist.atomic import TEMPORARY_SUFFIX, FileDigest, check_file, write_atomic
+from slotfilm_dist.config import to_dict
+from slotfilm_dist.replay.codec import decode, encode
+
+MANIFEST = "manifest.json"
+FORMAT = 1
+"""Version of the layout on disk."""
+
+LARGE_BYTES = 1 << 16
+"""Arrays from this size on get a file of their own."""
+
+_CHUNK_BYTES = 1 << 23
+_PREFIX = "replay-"
+
+
+def write_snapshot(directory: Path, state: Mapping[str, Any]) -> None:
+    """Write a state of nested mappings, scalars and arrays; takes no memory beyond one chunk.
+
+    Give it `ReplayShard.view()`, which copies nothing.
+
+    Raises:
+        OSError: the disk is full or not writable; the previous snapshot stays and nothing of the new one is left.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    previous = _read_manifest(directory) if (directory / MANIFEST).exists() else None
+    kept = set(previous["files"]) if previous else set()
+    _remove_files(directory, kept)
+    generation = previous["generation"] + 1 if previous else 0
+    arrays: dict[str, np.ndarray] = {}
+    rest = _take_arrays(state, "", arrays)
+    try:
+        files: dict[str, FileDigest] = {}
+        for path, array in arrays.items():
+            name = f"{_PREFIX}{generation}-{path}.bin"
+            files[name] = write_atomic(directory / name, _chunks(array))
+        name = f"{_PREFIX}{generation}.msgpack"
+        files[name] = write_atomic(directory / name, [encode(rest)])
+        manifest = {
+            "format": FORMAT,
+            "generation": generation,
+            "files": {name: to_dict(digest) for name, digest in files.items()},
+            "arrays": {
+                path: {"dtype": array.dtype.newbyteorder("<").str, "shape": array.shape}
+                for path, array in arrays.items()
+            },
+        }
+        write_atomic(directory / MANIFEST, [_signed(manifest)])
+    except BaseException:
+        _remove_files(directory, kept)
+        raise
+    _remove_files(directory, set(files))
+
+
+def read_snapshot(directory: Path) -> dict[str, Any]:
+    """The state written last; large arrays are mapped from their files, read-only, so copy them before the next write.
+
+    Raises:
+        ValueError: there is none, or a file is missing, cut short or altered; names the file.
+    """
+    manifest = _read_manifest(directory)
+    for name, digest in manifest["files"].items():
+        check_file(directory / name, FileDigest(**digest))
+    prefix = f"{_PREFIX}{manifest['generation']}"
+    state = decode((directory / f"{prefix}.msgpack").read_bytes())
+    for path, array in manifest["arrays"].items():
+        *parents, leaf = path.split(".")
+        owner = state
+        for parent in parents:
+            owner = owner[parent]
+        owner[leaf] = np.memmap(directory / f"{prefix}-{path}.bin", array["dtype"], "r", shape=tuple(array["shape"]))
+    return state
+
+
+def _take_arrays(state: Mapping[str, Any], prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The state without its large arrays, which are collected under their dotted path."""
+    rest: dict[str, Any] = {}
+    for key, value in state.items():
+        if isinstance(value, np.ndarray) and value.nbytes >= LARGE_BYTES:
+            arrays[prefix + key] = value
+        elif isinstance(value, Mapping):
+            rest[key] = _take_arrays(value, f"{prefix}{key}.", arrays)
+        else:
+            rest[key] = value
+    return rest
+
+
+def _chunks(array: np.ndarray) -> Iterator[bytes]:
+    """The array's bytes, little-endian, in order; a chunk is copied at a time."""
+    rows = max(1, _CHUNK_BYTES // max(1, array[:1].nbytes))
+    little = array.dtype.newbyteorder("<")
+    for start in range(0, len(array), rows):
+        yield array[start : start + rows].astype(little, copy=False).tobytes()
+
+
+def _signed(manifest: dict[str, Any]) -> bytes:
+    digest = hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
+    return json.dumps({"manifest": manifest, "sha256": digest}, indent=1).encode()
+
+
+def _read_manifest(directory: Path) -> dict[str, Any]:
+    path = directory / MANIFEST
+    try:
+        content = json.loads(path.read_bytes())
+        manifest, expected = content["manifest"], content["sha256"]
+    except FileNotFoundError:
+        raise ValueError(f"{path} is missing: {directory} holds no finished replay snapshot") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is corrupt: {error!r}") from None
+    if hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest() != expected:
+        raise ValueError(f"{path} is corrupt: its SHA-256 differs from the one it states")
+    if manifest["format"] != FORMAT:
+        raise ValueError(f"{path} has format {manifest['format']}, this version reads {FORMAT}")
+    return manifest
+
+
+def _remove_files(directory: Path, kept: set[str]) -> None:
+    """Delete what no finished snapshot needs: other generations and files cut off by a crash."""
+    for path in directory.glob(f"{_PREFIX}*"):
+        if path.name not in kept:
+            path.unlink()
+    (directory / (MANIFEST + TEMPORARY_SUFFIX)).unlink(missing_ok=True)

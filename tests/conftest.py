@@ -1,0 +1,28 @@
+"""Checks shapes and types of every call in the package, and keeps Ray to itself."""
+
+import os
+import tempfile
+from pathlib import Path
+
+import jaxtyping
+import pytest
+
+jaxtyping.install_import_hook("slotfilm_dist", "beartype.beartype")
+
+# Read by Ray when it starts, in this process and in those that it starts: no token in the user's home, no reports.
+_ray_files = tempfile.TemporaryDirectory(prefix="slotfilm-ray-")
+os.environ["RAY_AUTH_MODE"] = "disabled"
+os.environ["RAY_AUTH_TOKEN_PATH"] = str(Path(_ray_files.name) / "token")
+os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip the tests that need a GPU where torch finds none."""
+    needing = [item for item in items if item.get_closest_marker("gpu")]
+    if not needing:
+        return
+    import torch
+
+    if not torch.cuda.is_available():
+        for item in needing:
+            item.add_marker(pytest.mark.skip(reason="needs a CUDA GPU"))
