@@ -60,7 +60,7 @@ up_to_date() { [ -x "$venv/bin/python" ] && [ -f "$stamp" ] && [ "$(cat "$stamp"
 make_venv() {
   if [ -e "$venv" ]; then
     local reason place
-    place=$(sed -n 's/^VIRTUAL_ENV=//p' "$venv/bin/activate" 2>/dev/null | tr -d "\"'" | head -n 1)
+    place=$(sed -n 's/^VIRTUAL_ENV=//p' "$venv/bin/activate" 2>/dev/null | tr -d "\"'" | head -n 1) || true
     if reason=$(objection "$venv/bin/python") && [ -z "$reason" ] && [ "$place" = "$(pwd -P)/$venv" ]; then return; fi
     [ -f "$stamp" ] || [ -f "$log" ] ||
       die "$venv is not a working virtual environment of this folder with Python 3.11 or 3.12, and not made by this script; move it away and run this again"
@@ -89,7 +89,7 @@ install_project() {
   say "installing the dependencies (a few minutes the first time; details in $log)"
   read -ra extra <<<"${PIP_EXTRA_ARGS:-}"
   if ! "$venv/bin/python" -m pip install --no-input "${extra[@]}" -e ".[dev]" 2>&1 | tee "$log" | show_progress; then
-    die "pip could not install the dependencies: $(grep -a '^ERROR' "$log" | tail -n 1 || true) (all of it in $log)"
+    die "pip could not install the dependencies: $(grep -a -m 1 '^ERROR' "$log" | cut -c 1-300 || true) (all of it in $log)"
   fi
   fingerprint >"$stamp"
   say "the dependencies are installed"

@@ -159,7 +159,7 @@ def check_packages(distribution: str = DISTRIBUTION) -> Check:
 
 
 def probe_best_driver() -> tuple[VulkanProbe, VulkanProbe | None]:
-    """Render with the machine's own choice of driver and, if that fails, with the software driver where there is one."""
+    """Render with the machine's own choice of driver and, if that fails, with the software driver if there is one."""
     probe = probe_vulkan()
     software = software_driver()
     return probe, None if probe.ok or software is None else probe_vulkan(driver=software)

@@ -1,8 +1,8 @@
 """Every metric of the system, declared once: name, unit, kind and what it means.
 
-A name is `role_thing_unit`; the axes `time_s`, `env_steps`, `updates` and `phase` have no role. A metric with a label is
-written under `name/label`, as `worker_restarts_total/crash`. A counter's value is its total since the run began, over
-all restarts; a histogram's value is one observation; a gauge's value replaces the one before.
+A name is `role_thing_unit`; the axes `time_s`, `env_steps`, `updates` and `phase` have no role. A metric with a label
+is written under `name/label`, as `worker_restarts_total/crash`. A counter's value is its total since the run began,
+over all restarts; a histogram's value is one observation; a gauge's value replaces the one before.
 """
 
 import difflib
@@ -132,7 +132,7 @@ _LEARNER = (
     _duration("learner_batch_wait_s", "Time the learner waited for a batch."),
     _counter("learner_wait_s_total", "s", "Time the learner has waited for the limiter and replay."),
     _gauge("learner_wait_share", "share", "Share of the learner's time spent waiting."),
-    _gauge("learner_critic_loss", "1", "Loss of both critics, mean squared error to the bootstrapped target."),
+    _gauge("learner_critic_loss", "1", "Sum of both critics' losses, half the mean squared error to the target."),
     _gauge("learner_value_loss", "1", "Loss of the value network."),
     _gauge("learner_actor_loss", "1", "Loss of the actor, temperature times log-probability minus Q."),
     _gauge("learner_temperature_loss", "1", "Loss of the entropy temperature, when it is tuned."),
@@ -185,7 +185,9 @@ _PRETRAIN = (
     _gauge("pretrain_loss", "1", "Weighted sum of the three pre-training losses."),
     _gauge("pretrain_position_loss", "1", "Position loss, in the units of `pretrain.uv_units`."),
     _gauge("pretrain_visibility_loss", "nats", "Visibility loss, binary cross-entropy."),
-    _gauge("pretrain_attention_loss", "nats", "Attention alignment loss, minus the log of the attention on the object."),
+    _gauge(
+        "pretrain_attention_loss", "nats", "Attention alignment loss, minus the log of the attention on the object."
+    ),
     _gauge("pretrain_position_error_px", "px", "Mean distance of predicted and true position, held-out frames."),
     _gauge("pretrain_baseline_error_px", "px", "The same for a constant prediction, the training frames' mean."),
     _gauge("pretrain_visibility_auroc", "share", "AUROC of the visibility head, held-out frames; 0.5 is chance."),

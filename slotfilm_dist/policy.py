@@ -106,13 +106,13 @@ class AgentPolicy:
         )
         self.version = version
 
-    def save_noise(self) -> np.ndarray:
-        """State of the action noise."""
-        return self._noise.get_state().numpy()
+    def save_noise(self) -> str:
+        """State of the action noise, as hexadecimal digits."""
+        return self._noise.get_state().numpy().tobytes().hex()
 
-    def load_noise(self, state: np.ndarray) -> None:
+    def load_noise(self, state: str) -> None:
         """Continue the action noise."""
-        self._noise.set_state(torch.from_numpy(np.array(state)))
+        self._noise.set_state(torch.frombuffer(bytearray.fromhex(state), dtype=torch.uint8))
 
 
 def stored_pictures(observation: Observation) -> Shaped[np.ndarray, "envs *visual"]:

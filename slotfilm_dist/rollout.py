@@ -1,69 +1,17 @@
 """Steps environments with a policy and packs what happened into blocks."""
 
-from collections.abc import Iterator
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from slotfilm_dist.contracts import VectorEnv
+from slotfilm_dist.episodes import EpisodeTracker
 from slotfilm_dist.messages import EpisodeSummary, Observation, StepResult, TransitionBlock
 from slotfilm_dist.policy import Policy
 
 TRAINING_SEEDS = 10_000_000
 """Training episodes are seeded below this; evaluation from here on."""
-
-
-def episode_seeds(seed: np.random.SeedSequence) -> Iterator[int]:
-    """Endless episode seeds below `TRAINING_SEEDS`, drawn from a worker's own stream."""
-    rng = np.random.default_rng(seed)
-    while True:
-        yield int(rng.integers(TRAINING_SEEDS))
-
-
-class EpisodeTracker:
-    """Sums up the running episode of every environment.
-
-    Args:
-        seeds: of the episodes that have just begun.
-        num_terms: components of the reward.
-    """
-
-    def __init__(self, seeds: list[int], num_terms: int) -> None:
-        self._seeds = list(seeds)
-        count = len(seeds)
-        self._length = np.zeros(count, np.int64)
-        self._return = np.zeros(count)
-        self._success = np.zeros(count, bool)
-        self._grasped = np.zeros(count, bool)
-        self._terms = np.zeros((count, num_terms))
-
-    def add(self, step: StepResult, next_seeds: list[int]) -> list[EpisodeSummary]:
-        """Take one `StepResult` in; gives the summaries of the episodes that it ended."""
-        self._length += 1
-        self._return += step.reward
-        self._success |= step.success
-        self._grasped |= step.grasped
-        self._terms += step.reward_terms
-        ended = np.flatnonzero(step.terminated | step.truncated)
-        return [self._finish(int(i), step, next_seeds[i]) for i in ended]
-
-    def _finish(self, i: int, step: StepResult, next_seed: int) -> EpisodeSummary:
-        summary = EpisodeSummary(
-            seed=self._seeds[i],
-            length=int(self._length[i]),
-            episode_return=float(self._return[i]),
-            success_once=bool(self._success[i]),
-            success_at_end=bool(step.success[i]),
-            placed_at_end=bool(step.placed[i]),
-            grasped_once=bool(self._grasped[i]),
-            reward_terms=tuple(float(x) for x in self._terms[i]),
-        )
-        self._seeds[i] = next_seed
-        self._length[i] = 0
-        self._return[i] = 0
-        self._success[i] = self._grasped[i] = False
-        self._terms[i] = 0
-        return summary
 
 
 class RolloutLoop:
@@ -88,12 +36,9 @@ class RolloutLoop:
         self._worker_id = worker_id
         self._incarnation = incarnation
         self._sequence = 0
-        self._seeds = episode_seeds(seed)
-        self._next_seeds = self._draw_seeds()
-        first = self._draw_seeds()
-        self._observation = env.reset(first)
-        self._visual = policy.visual(self._observation)
-        self._tracker = EpisodeTracker(first, len(env.reward_term_names))
+        self._rng = np.random.default_rng(seed)
+        first, self._next_seeds = ([self._draw_seed() for _ in range(env.num_envs)] for _ in range(2))
+        self._begin(first)
 
     @property
     def policy(self) -> Policy:
@@ -101,11 +46,16 @@ class RolloutLoop:
         return self._policy
 
     def collect(self, num_steps: int) -> TransitionBlock:
-        """Take `num_steps` steps in every environment."""
+        """Take `num_steps` steps in every environment; a single environment stops early where its episode ends.
+
+        A block thus ends where the simulator's state follows from a seed alone, and `save` is exact there.
+        """
         lanes = [_Lane() for _ in range(self.env.num_envs)]
         episodes: list[EpisodeSummary] = []
         for _ in range(num_steps):
             episodes += self._step(lanes)
+            if episodes and self.env.num_envs == 1:
+                break
         for i, lane in enumerate(lanes):
             if lane.open:
                 lane.add_frame(self._observation, self._visual, i)
@@ -124,14 +74,42 @@ class RolloutLoop:
                 lanes[i].add_frame(step.final, final_visual, i)
         ended = self._tracker.add(step, self._next_seeds)
         self._next_seeds = [
-            next(self._seeds) if done else seed for done, seed in zip(over, self._next_seeds, strict=True)
+            self._draw_seed() if done else seed for done, seed in zip(over, self._next_seeds, strict=True)
         ]
         self._observation = step.observation
         self._visual = self._policy.visual(step.observation)
         return ended
 
-    def _draw_seeds(self) -> list[int]:
-        return [next(self._seeds) for _ in range(self.env.num_envs)]
+    @property
+    def at_episode_start(self) -> bool:
+        """Every environment has just been reset."""
+        return self._tracker.num_running_steps == 0
+
+    def save(self) -> dict[str, Any]:
+        """Where the loop stands, as plain values; exact where `at_episode_start` holds, else the episode restarts."""
+        return {
+            "sequence": self._sequence,
+            "incarnation": self._incarnation,
+            "running_seeds": self._tracker.running_seeds,
+            "next_seeds": list(self._next_seeds),
+            "rng": self._rng.bit_generator.state,
+        }
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Continue: the running episodes start again from their seeds, and the same ones follow."""
+        self._sequence = int(state["sequence"])
+        self._incarnation = int(state["incarnation"])
+        self._rng.bit_generator.state = dict(state["rng"])
+        self._next_seeds = [int(seed) for seed in state["next_seeds"]]
+        self._begin([int(seed) for seed in state["running_seeds"]])
+
+    def _begin(self, seeds: list[int]) -> None:
+        self._observation = self.env.reset(seeds)
+        self._visual = self._policy.visual(self._observation)
+        self._tracker = EpisodeTracker(seeds, len(self.env.reward_term_names))
+
+    def _draw_seed(self) -> int:
+        return int(self._rng.integers(TRAINING_SEEDS))
 
     def _pack(self, lanes: list["_Lane"], episodes: tuple[EpisodeSummary, ...]) -> TransitionBlock:
         columns: dict[str, np.ndarray] = {

@@ -43,8 +43,8 @@ class ClosableSink(Protocol):
 class JsonLinesSink:
     """Appends one JSON object a line, complete on disk when `write` returns.
 
-    A line holds `time_s`, `env_steps`, `updates`, `phase` (a word) and the values written with them. A value that is not
-    finite becomes null and is counted in `num_nonfinite`. Opening a file whose last line was torn by a crash cuts
+    A line holds `time_s`, `env_steps`, `updates`, `phase` (a word) and the values written with them. A value that is
+    not finite becomes null and is counted in `num_nonfinite`. Opening a file whose last line was torn by a crash cuts
     that line off; a write that fails half way (disk full) leaves no half line behind.
     """
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import jaxtyping
 import pytest
 
-jaxtyping.install_import_hook("slotfilm_dist", "beartype.beartype")
+# With the numeric tower, as in PEP 484: an int may be given where a float is asked for.
+jaxtyping.install_import_hook("slotfilm_dist", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
 
 # Read by Ray when it starts, in this process and in those that it starts: no token in the user's home, no reports.
 _ray_files = tempfile.TemporaryDirectory(prefix="slotfilm-ray-")

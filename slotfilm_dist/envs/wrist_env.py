@@ -15,7 +15,6 @@ from torch import Tensor
 
 import slotfilm_dist.envs.pick_banana  # noqa: F401  registers PickBanana-v1
 from slotfilm_dist.config import RunConfig
-from slotfilm_dist.envs.camera import WristCamera, render_device
 from slotfilm_dist.envs.projection import project
 from slotfilm_dist.envs.scene import SceneReader, SceneState
 from slotfilm_dist.envs.tasks import task_named
@@ -44,8 +43,12 @@ class WristEnv:
         kwargs: dict[str, Any] = {"control_mode": config.env.control_mode}
         if own:
             kwargs |= {"task_config": config.env, "reward_config": config.reward, "success_config": config.success}
+        backend = "none"
         if camera:
+            from slotfilm_dist.envs.camera import WristCamera, render_device
+
             kwargs |= {"sensor_configs": WristCamera.sensor_configs(config.env)}
+            backend = render_device(config.env.render_backend)
         self._env: Any = gym.make(
             self._task.env_id,
             num_envs=num_envs,
@@ -53,14 +56,19 @@ class WristEnv:
             reward_mode="dense" if own else "normalized_dense",
             robot_uids=self._task.robot,
             sim_backend="physx_cuda" if config.env.sim_backend == "gpu" else "physx_cpu",
-            render_backend=render_device(config.env.render_backend) if camera else "none",
+            render_backend=backend,
             **kwargs,
         ).unwrapped
         self.action_dim = int(self._env.single_action_space.shape[0])
         self.reward_term_names: tuple[str, ...] = OWN_TERMS if own else ("reward",)
-        self._camera = WristCamera(self._env, config.env) if camera else None
+        self._camera = WristCamera(self._env, config.env) if camera else None  # imported above, only where needed
         self._reader = SceneReader(self._env, self._task.objects, self._task.goal)
         self._elapsed = np.zeros(num_envs, np.int64)
+
+    @property
+    def has_camera(self) -> bool:
+        """Whether pictures are rendered."""
+        return self._camera is not None
 
     @property
     def base_env(self) -> Any:

@@ -1,13 +1,11 @@
 """Figures of one run, drawn from its files: pre-training, return, success, reward components, learner, throughput.
 
-Colours keep apart for colour-blind readers (Okabe and Ito's palette) and lines also differ in style, so that a grey
-print still reads. Smoothing is causal everywhere: no curve rises before the event that made it rise.
+Smoothing is causal everywhere: no curve rises before the event that made it rise.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -15,34 +13,25 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, PercentFormatter
+from matplotlib.ticker import PercentFormatter
 
+from slotfilm_dist.evaluation.figure_style import (
+    BLUE,
+    GREEN,
+    GREY,
+    LINES,
+    ORANGE,
+    RED,
+    SKY,
+    STYLE,
+    steps_axis,
+    values_axis,
+)
 from slotfilm_dist.evaluation.record import RunRecord
 from slotfilm_dist.evaluation.statistics import causal_mean
 from slotfilm_dist.metrics import METRICS
 
-BLUE, ORANGE, GREEN, RED, PURPLE, SKY, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#666666"
-
-_CYCLE = ((BLUE, "-"), (ORANGE, "--"), (GREEN, "-."), (PURPLE, ":"), (RED, (0, (5, 1))), (SKY, (0, (3, 1, 1, 1))))
-_STYLE: dict[str, Any] = {
-    "figure.facecolor": "white",
-    "axes.facecolor": "white",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#dddddd",
-    "grid.linewidth": 0.6,
-    "axes.titlesize": 11,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.labelsize": 10,
-    "font.size": 10,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "lines.linewidth": 1.8,
-}
 _EPISODE_WINDOW = 100
-_STEPS_LABEL = "environment steps"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -64,7 +53,7 @@ def draw_figures(record: RunRecord, folder: Path) -> tuple[list[RunFigure], list
     folder.mkdir(parents=True, exist_ok=True)
     drawn, missing = [], []
     for stem, title, draw in _FIGURES:
-        with rc_context(_STYLE):
+        with rc_context(STYLE):
             figure = Figure(layout="constrained")
             FigureCanvasAgg(figure)
             text = draw(record, figure)
@@ -76,17 +65,12 @@ def draw_figures(record: RunRecord, folder: Path) -> tuple[list[RunFigure], list
     return drawn, missing
 
 
-def _steps_axis(axes: Axes, label: str = _STEPS_LABEL) -> None:
-    axes.set_xlabel(label)
-    axes.xaxis.set_major_formatter(EngFormatter(sep=" "))
-    axes.set_xlim(left=0)
-
-
 def _draw_pretraining(record: RunRecord, figure: Figure) -> str:
     axis = "pretrain_steps_total"
+    pixels = record.config is not None and record.config.pretrain.uv_units == "pixels"
     panels = (
-        ("pretrain_position_loss", "(a) position", "loss (`pretrain.uv_units`)"),
-        ("pretrain_attention_loss", "(b) attention alignment", "−log attention (nats)"),
+        ("pretrain_position_loss", "(a) position", "loss (px)" if pixels else "loss (image units)"),
+        ("pretrain_attention_loss", "(b) attention alignment", "negative log attention (nats)"),
         ("pretrain_visibility_loss", "(c) visibility", "cross-entropy (nats)"),
     )
     if not any(len(record.series(key, axis)[0]) for key, _, _ in panels):
@@ -98,7 +82,7 @@ def _draw_pretraining(record: RunRecord, figure: Figure) -> str:
         axes.plot(steps, values, color=BLUE, alpha=0.25, linewidth=0.8)
         axes.plot(steps, causal_mean(values, _window(values)), color=BLUE)
         axes.set(title=title, ylabel=label)
-        _steps_axis(axes, "gradient steps")
+        steps_axis(axes, "gradient steps")
         axes.set_ylim(bottom=min(0, values.min(initial=0)))
     return "Losses of slot pre-training over gradient steps. " + _draw_pixel_error(record, grid[3], axis)
 
@@ -115,7 +99,7 @@ def _draw_pixel_error(record: RunRecord, axes: Axes, axis: str) -> str:
         axes.plot(base_steps, baseline, color=RED, linestyle="--", label="predicting the mean")
     axes.set_ylim(bottom=0)
     axes.legend()
-    _steps_axis(axes, "gradient steps")
+    steps_axis(axes, "gradient steps")
     against = f", where predicting the mean position gives {baseline[-1]:.1f} px" if len(baseline) else ""
     return f"The held-out position error ends at {error[-1]:.1f} px{against}."
 
@@ -138,7 +122,7 @@ def _draw_return(record: RunRecord, figure: Figure) -> str:
     if record.episodes:
         steps = np.array([e.env_steps for e in record.episodes], dtype=np.float64)
         returns = np.array([e.summary.episode_return for e in record.episodes])
-        axes.scatter(steps, returns, s=6, color=GREY, alpha=0.35, linewidths=0, label="training episode")
+        axes.scatter(steps, returns, s=8, color=GREY, alpha=0.5, linewidths=0, label="training episode")
         axes.plot(steps, causal_mean(returns, window), color=BLUE, label=f"mean of the last {window} episodes")
         _episode_axis(axes, steps)
     if trained:
@@ -155,10 +139,14 @@ def _draw_return(record: RunRecord, figure: Figure) -> str:
         text += f" The random policy's mean return is {random.mean_return:.1f}."
     axes.set_ylabel("return of an episode (unscaled)")
     if record.config:
+        start = record.config.schedule.random_steps
+        axes.axvline(start, color=GREY, linestyle=":", linewidth=1.2, label="random collection ends")
         scale = record.config.sac.reward_scale
-        right = axes.secondary_yaxis("right", functions=(lambda y: y * scale, lambda y: y / scale))
-        right.set_ylabel(f"times the reward scale, {scale:g}")
-    _steps_axis(axes)
+        right = axes.secondary_yaxis(
+            "right", functions=(lambda y: np.multiply(y, scale), lambda y: np.divide(y, scale))
+        )
+        right.set_ylabel(f"return at reward scale {scale:g}")
+    steps_axis(axes)
     axes.legend(loc="upper left")
     return text
 
@@ -194,11 +182,18 @@ def _draw_success(record: RunRecord, figure: Figure) -> str:
         bars = np.abs(ends - rate)
         places = [e.env_steps for e in trained]
         axes.errorbar(
-            places, rate, bars, fmt="D", color=ORANGE, capsize=3, markersize=5, label="evaluation, solved at the end, 95 %"
+            places,
+            rate,
+            bars,
+            fmt="D",
+            color=ORANGE,
+            capsize=3,
+            markersize=5,
+            label="evaluation, solved at the end, 95 %",
         )
     axes.set(ylabel=f"share of the last {window} episodes", ylim=(-0.02, 1.02))
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-    _steps_axis(axes)
+    steps_axis(axes)
     axes.legend(loc="upper left")
     return f"Share of the last {window} training episodes with a grasp and solved; evaluations with Wilson intervals."
 
@@ -214,26 +209,24 @@ def _draw_reward_terms(record: RunRecord, figure: Figure) -> str:
     sums = np.array([e.summary.reward_terms for e in record.episodes], dtype=np.float64)
     lengths = np.array([e.summary.length for e in record.episodes], dtype=np.float64)[:, None]
     smooth = np.stack([causal_mean(column, window) for column in (sums / np.maximum(lengths, 1)).T])
-    for (color, line), name, curve in zip(_CYCLE * len(names), names, smooth, strict=False):
+    for (color, line), name, curve in zip(LINES * len(names), names, smooth, strict=False):
         left.plot(steps, curve, color=color, ls=line, label=name)
     left.set(title="(a) reward of a step", ylabel="mean, unscaled", ylim=(0, None))
     left.legend(ncols=2)
     share = smooth / np.maximum(smooth.sum(axis=0), 1e-12)
-    colors = [color for color, _ in _CYCLE * len(names)][: len(names)]
+    colors = [color for color, _ in LINES * len(names)][: len(names)]
     right.stackplot(steps, share, colors=colors, labels=names, alpha=0.85, edgecolor="white", linewidth=0.6)
     right.set(title="(b) share of the reward", ylim=(0, 1))
     right.yaxis.set_major_formatter(PercentFormatter(1.0))
     right.margins(x=0)
     right.grid(False)
     for axes in (left, right):
-        _steps_axis(axes)
+        steps_axis(axes)
     order = ", ".join(names)
     return f"Components of the reward ({order}; in (b) from bottom to top), mean of the last {window} episodes."
 
 
-def _draw_panels(
-    record: RunRecord, figure: Figure, panels: tuple[tuple[str, tuple[str, ...], bool], ...]
-) -> list[str]:
+def _draw_panels(record: RunRecord, figure: Figure, panels: tuple[tuple[str, tuple[str, ...], bool], ...]) -> list[str]:
     """Small plots of metrics over environment steps; gives the titles of those that have numbers."""
     found = [(title, keys, log) for title, keys, log in panels if any(len(record.series(k)[0]) for k in keys)]
     if not found:
@@ -243,17 +236,20 @@ def _draw_panels(
     figure.set_size_inches(10, 2.7 * rows + 0.4)
     cells = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, (title, keys, log) in zip(cells, found, strict=False):
-        for (color, line), key in zip(_CYCLE, keys, strict=False):
+        for (color, line), key in zip(LINES, keys, strict=False):
             steps, values = record.series(key)
-            label = key.split("_", 1)[1].replace("_", " ") if len(keys) > 1 else None
+            words = key if len({METRICS[k].role for k in keys}) > 1 else key.split("_", 1)[1]
+            label = words.replace("_", " ") if len(keys) > 1 else None
             if len(steps):
                 axes.plot(steps, causal_mean(values, _window(values)), color=color, ls=line, label=label)
-        axes.set(title=title, ylabel=unit if (unit := METRICS[keys[0]].unit) != "1" else "value")
+                if np.ptp(values) == 0 and values[0]:
+                    axes.set_ylim(*sorted((0.0, 2 * values[0])))
+        axes.set(title=title, ylabel=unit if (unit := METRICS[next(iter(keys))].unit) != "1" else "value")
         if log:
             axes.set_yscale("log")
         if len(keys) > 1:
             axes.legend(fontsize=8)
-        _steps_axis(axes)
+        steps_axis(axes)
     for axes in cells[len(found) :]:
         axes.remove()
     return [title for title, _, _ in found]
@@ -268,7 +264,7 @@ def _draw_learner(record: RunRecord, figure: Figure) -> str:
         ("entropy", ("learner_entropy_nats",), False),
         ("temperature", ("learner_temperature",), False),
         ("gradient norms", gradients, True),
-        ("FiLM mean |tanh γ|, |β|", ("learner_film_gain", "learner_film_shift"), False),
+        ("FiLM gain and shift", ("learner_film_gain", "learner_film_shift"), False),
         ("age of the acting weights", ("weights_age_updates",), False),
         ("age of sampled steps", ("replay_sample_age_steps",), False),
     )
@@ -287,8 +283,7 @@ def _draw_throughput(record: RunRecord, figure: Figure) -> str:
     )
     titles = _draw_panels(record, figure, panels)
     for axes in figure.axes:
-        axes.set_ylim(bottom=0)
-        axes.yaxis.set_major_formatter(EngFormatter(sep=" "))
+        values_axis(axes)
     return f"Speed and balance of the run over environment steps: {', '.join(titles)}." if titles else ""
 
 

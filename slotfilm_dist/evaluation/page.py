@@ -12,19 +12,26 @@ import numpy as np
 from slotfilm_dist.config import RunConfig, changed_fields, to_dict
 from slotfilm_dist.evaluation import page_parts as html
 from slotfilm_dist.evaluation.figures import draw_figures
+from slotfilm_dist.evaluation.page_tables import (
+    episode_table,
+    evaluation_table,
+    metric_table,
+    reward_table,
+    share,
+    success_interval,
+)
 from slotfilm_dist.evaluation.record import Evaluation, RunRecord, read_run
 from slotfilm_dist.evaluation.statistics import PairedDifference, paired_difference
-from slotfilm_dist.metrics import METRICS, PHASES
+from slotfilm_dist.metrics import PHASES
 
 _MAX_VIDEO_BYTES = 3_000_000
 _MACHINE_KEYS = ("command", "started_at", "python", "platform", "cpu", "gpu")
-_STAGES = ("early third", "middle third", "late third")
 _SECTIONS = (
     ("missing", "Not in this report"),
-    ("config", "Configuration"),
-    ("videos", "Rollouts"),
     ("figures", "Figures"),
+    ("videos", "Rollouts"),
     ("tables", "Numbers"),
+    ("config", "Configuration"),
     ("origin", "Origin"),
 )
 
@@ -44,7 +51,7 @@ def write_page(run_dir: Path) -> Path:
         "config": _configuration(record),
         "videos": videos,
         "figures": "\n".join(html.picture(f.path, f.title, f.text) for f in figures),
-        "tables": _evaluation_table(record) + _reward_table(record) + _episode_table(record) + _metric_table(record),
+        "tables": evaluation_table(record) + reward_table(record) + episode_table(record) + metric_table(record),
         "origin": _origin(record),
     }
     sections = [html.section(anchor, title, bodies[anchor]) for anchor, title in _SECTIONS]
@@ -125,14 +132,14 @@ def _return_card(
     notes = [f"± {html.number(best.std_return)} s.d. over {len(best.episodes)} episodes"]
     if record.config:
         scale = record.config.sac.reward_scale
-        notes.append(f"{html.number(best.mean_return * scale, 0)} times the reward scale {scale:g}")
+        notes.append(f"at reward scale {scale:g}: {html.number(best.mean_return * scale, 0)}")
     if random:
         notes.append(f"random policy: {html.number(random.mean_return)}")
     quality = ""
     if difference:
         low, high = difference.interval
         notes.append(
-            f"difference {html.signed(difference.mean)} [{html.signed(low)}, {html.signed(high)}], "
+            f"difference {html.signed(difference.mean)}, 95 % interval {html.interval(low, high)}; "
             f"better on {difference.num_better} of {difference.num_pairs} seeds"
         )
         quality = "good" if low > 0 else "bad" if high < 0 else ""
@@ -145,22 +152,13 @@ def _success_card(best: Evaluation | None, random: Evaluation | None) -> str:
         return html.card(title, "not evaluated", [])
     notes = [
         f"{sum(e.success_at_end for e in best.episodes)} of {len(best.episodes)} episodes",
-        f"95 % Wilson interval {_interval(best)}",
-        f"at some step: {_share(best, 'success_once')}, grasped: {_share(best, 'grasped_once')}",
+        f"95 % Wilson interval {success_interval(best)}",
+        f"at some step: {share(best, 'success_once')}, grasped: {share(best, 'grasped_once')}",
     ]
     if random:
-        notes.append(f"random policy: {html.percent(random.success_rate)} {_interval(random)}")
+        notes.append(f"random policy: {html.percent(random.success_rate)} {success_interval(random)}")
     clear = random is not None and best.success_interval[0] > random.success_interval[1]
     return html.card(title, html.percent(best.success_rate), notes, "good" if clear else "")
-
-
-def _interval(evaluation: Evaluation) -> str:
-    low, high = evaluation.success_interval
-    return f"[{100 * low:.1f}, {100 * high:.1f}] %"
-
-
-def _share(evaluation: Evaluation, flag: str) -> str:
-    return html.percent(sum(getattr(e, flag) for e in evaluation.episodes) / max(len(evaluation.episodes), 1))
 
 
 def _position_card(record: RunRecord) -> str:
@@ -215,76 +213,13 @@ def _videos(record: RunRecord) -> tuple[str, list[str]]:
                 f"videos/{path.name}: {size / 1e6:.1f} MB is too large for this page (3 MB); it lies beside it."
             )
             continue
-        parts.append(html.video(path, None, f"{path.stem}: camera with predicted (x) and true (o) positions, attention"))
+        parts.append(
+            html.video(path, None, f"{path.stem}: camera with predicted (x) and true (o) positions, attention")
+        )
         strip = path.with_suffix(".png")
         if strip.exists():
             parts.append(html.picture(strip, path.stem, "Evenly spaced pictures of the episode, left to right."))
     return "\n".join(parts), left_out
-
-
-def _evaluation_table(record: RunRecord) -> str:
-    head = ("evaluation", "policy", "env steps", "episodes", "return ± s.d.", "solved at end", "95 % interval")
-    rows = [
-        (
-            e.name,
-            e.policy,
-            html.number(e.env_steps, 0),
-            str(len(e.episodes)),
-            f"{html.number(e.mean_return)} ± {html.number(e.std_return)}",
-            html.percent(e.success_rate),
-            _interval(e),
-            _share(e, "success_once"),
-            _share(e, "placed_at_end"),
-            _share(e, "grasped_once"),
-        )
-        for e in record.evaluations
-    ]
-    return html.table((*head, "solved once", "placed at end", "grasped"), rows, "Evaluations on held-out seeds.")
-
-
-def _reward_table(record: RunRecord) -> str:
-    names = record.reward_term_names
-    if len(names) < 2 or len(record.episodes) < len(_STAGES):
-        return ""
-    sums = np.array([e.summary.reward_terms for e in record.episodes], dtype=np.float64)
-    share = 100 * sums / np.maximum(sums.sum(axis=1, keepdims=True), 1e-12)
-    rows = [
-        (stage, *(f"{part[:, i].mean():.1f} ± {part[:, i].std():.1f}" for i in range(len(names))))
-        for stage, part in zip(_STAGES, np.array_split(share, len(_STAGES)), strict=True)
-    ]
-    return html.table(
-        ("training", *names), rows, "Share of each component in an episode's reward, in %, mean ± s.d. over episodes."
-    )
-
-
-def _episode_table(record: RunRecord) -> str:
-    best = record.best_known
-    if best is None:
-        return ""
-    random = record.evaluation("random")
-    theirs = random.returns_by_seed if random else {}
-    rows = [
-        (
-            str(e.seed),
-            html.number(e.episode_return),
-            html.number(theirs[e.seed]) if e.seed in theirs else "not played",
-            str(e.length),
-            *("yes" if flag else "no" for flag in (e.success_at_end, e.success_once, e.placed_at_end, e.grasped_once)),
-        )
-        for e in best.episodes
-    ]
-    head = ("seed", "return", "random policy", "steps", "solved at end", "solved once", "placed at end", "grasped")
-    return html.folded(f"Every episode of the evaluation “{best.name}”", html.table(head, rows))
-
-
-def _metric_table(record: RunRecord) -> str:
-    keys = dict.fromkeys(key for line in record.lines for key in line)
-    rows = []
-    for key in sorted(keys, key=lambda k: list(METRICS).index(k.split("/")[0]) if k.split("/")[0] in METRICS else -1):
-        metric, value = METRICS.get(key.split("/")[0]), record.last(key)
-        if metric and value is not None:
-            rows.append((key, f"{value:.6g}".replace("-", "−"), metric.unit, metric.help))
-    return html.folded("Last value of every metric", html.table(("metric", "value", "unit", "meaning"), rows))
 
 
 def _origin(record: RunRecord) -> str:

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
+_MINUS = "\N{MINUS SIGN}"
+_NO_BREAK = "\N{NO-BREAK SPACE}"
 _MEDIA_TYPES = {".png": "image/png", ".mp4": "video/mp4"}
 
 
@@ -31,34 +33,34 @@ def card(title: str, value: str, notes: Sequence[str], quality: str = "") -> str
         title: what it is.
         value: the number with its unit.
         notes: lines below it.
-        quality: `good`, `bad` or empty; shown as a mark in words too, never by colour alone.
+        quality: `good`, `bad` or empty; colours the edge, while the notes say it in words.
     """
-    lines = "".join(f"<li>{escape(note)}</li>" for note in notes)
-    return (
-        f'<div class="card {quality}"><h3>{escape(title)}</h3><p class="value">{escape(value)}</p><ul>{lines}</ul></div>'
-    )
+    body = f'<p class="value">{escape(value)}</p>{bullets(notes)}'
+    return f'<div class="card {quality}"><h3>{escape(title)}</h3>{body}</div>'
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "") -> str:
-    """A table whose first column names the row; cells that start with a digit or sign align to the right."""
+    """A table whose first column names the row; columns of numbers align to the right."""
     if not rows:
         return ""
-    top = "".join(f'<th scope="col">{escape(h)}</th>' for h in head)
-    body = "".join(f"<tr>{_cells(row)}</tr>" for row in rows)
+    columns = list(zip(*rows, strict=True))
+    kinds = ["", *(' class="number"' if all(map(_is_number, column)) else "" for column in columns[1:])]
+    top = "".join(f'<th scope="col"{kind}>{escape(title)}</th>' for title, kind in zip(head, kinds, strict=True))
+    lines = []
+    for first, *cells in rows:
+        line = "".join(f"<td{kind}>{escape(cell)}</td>" for cell, kind in zip(cells, kinds[1:], strict=True))
+        lines.append(f'<tr><th scope="row">{escape(first)}</th>{line}</tr>')
     title = f"<caption>{escape(caption)}</caption>" if caption else ""
+    body = "".join(lines)
     return f'<div class="wide"><table>{title}<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
-def _cells(row: Sequence[str]) -> str:
-    first = f'<th scope="row">{escape(row[0])}</th>'
-    return first + "".join(
-        f'<td class="number">{escape(cell)}</td>' if cell[:1].isdigit() or cell[:1] in "+−" else f"<td>{escape(cell)}</td>"
-        for cell in row[1:]
-    )
+def _is_number(cell: str) -> bool:
+    return cell[:1].isdigit() or cell[:1] in ("+", _MINUS)
 
 
 def folded(title: str, body: str) -> str:
-    """A part that is closed until it is asked for; printed open."""
+    """A part that is closed until it is asked for."""
     return f"<details><summary>{escape(title)}</summary>\n{body}\n</details>" if body else ""
 
 
@@ -81,7 +83,7 @@ def picture(path: Path, title: str, text: str) -> str:
 
 
 def video(path: Path, poster: Path | None, text: str) -> str:
-    """A video with controls; printed as its poster where it has one."""
+    """A video with controls, shown as its poster until it plays."""
     still = f' poster="{data_uri(poster)}"' if poster else ""
     label = escape(text, quote=True)
     return (
@@ -92,7 +94,12 @@ def video(path: Path, poster: Path | None, text: str) -> str:
 
 def number(value: float | int, digits: int = 1) -> str:
     """A number for people: thousands separated, a true minus sign."""
-    return f"{value:,.{digits}f}".replace("-", "−").replace(",", "\u00a0")
+    return f"{value:,.{digits}f}".replace("-", _MINUS).replace(",", _NO_BREAK)
+
+
+def short(value: float | int) -> str:
+    """A number of unknown size, to six digits."""
+    return f"{value:.6g}".replace("-", _MINUS)
 
 
 def signed(value: float | int, digits: int = 1) -> str:
@@ -100,9 +107,14 @@ def signed(value: float | int, digits: int = 1) -> str:
     return ("+" if value >= 0 else "") + number(value, digits)
 
 
+def interval(low: float, high: float, unit: str = "", digits: int = 1) -> str:
+    """Both ends of an interval, never broken over two lines."""
+    return f"[{number(low, digits)}, {number(high, digits)}]{unit}".replace(" ", _NO_BREAK)
+
+
 def percent(share: float | int, digits: int = 0) -> str:
     """A share as percentage."""
-    return f"{100 * share:.{digits}f} %"
+    return f"{100 * share:.{digits}f}{_NO_BREAK}%"
 
 
 def duration(seconds: float | int) -> str:

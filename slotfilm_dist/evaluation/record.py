@@ -160,7 +160,9 @@ def read_run(run_dir: Path) -> RunRecord:
             "evaluation/final.json: the run has no final evaluation yet; `slotfilm evaluate` on this run writes it."
         )
     if not record.evaluation("random"):
-        missing.append("evaluation/random.json: the random policy was not evaluated, so nothing says what chance gives.")
+        missing.append(
+            "evaluation/random.json: the random policy was not evaluated, so nothing says what chance gives."
+        )
     if not record.videos:
         missing.append("videos/*.mp4: no rollout was recorded; set evaluation.videos to 1 or more and evaluate.")
     return record

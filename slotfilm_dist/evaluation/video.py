@@ -20,7 +20,16 @@ OBJECT_COLORS: tuple[Color, ...] = ((255, 165, 0), (255, 60, 50), (255, 255, 90)
 """True position of each object, drawn as o: orange and red as in the paper, then yellow and white."""
 
 _HEAT = np.array(
-    [(0, 0, 4), (40, 11, 84), (101, 21, 110), (159, 42, 99), (212, 72, 66), (245, 125, 21), (250, 193, 39), (252, 255, 164)]
+    [
+        (0, 0, 4),
+        (40, 11, 84),
+        (101, 21, 110),
+        (159, 42, 99),
+        (212, 72, 66),
+        (245, 125, 21),
+        (250, 193, 39),
+        (252, 255, 164),
+    ]
 )
 """Anchors of a colour map whose brightness rises evenly, so that it also reads in grey."""
 
@@ -43,7 +52,7 @@ class RolloutFrame:
     """What the wrist camera saw."""
     attention: Float[np.ndarray, "slots tokens"]
     """Each slot's attention, heads averaged, row by row; no rows for an agent without slots."""
-    uv_predicted: Float[np.ndarray, "slots 2"]
+    uv_predicted: Float[np.ndarray, "predictions 2"]
     """Each slot's predicted position in image units; no rows for an agent without UV head."""
     uv: Float[np.ndarray, "objects 2"]
     """The objects' true positions in image units."""
@@ -84,7 +93,7 @@ def attention_overlay(
 def draw_frame(
     frame: RolloutFrame, *, step: int, num_steps: int, episode_return: float, panel_px: int = 256
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """The camera's picture with predicted (x) and true (o) positions, beside every slot's attention; the score below.
+    """The camera's picture with predicted (x) and true (o) positions, beside every slot's attention; the score above.
 
     Slots are exchangeable: which of them follows which object may differ from run to run, so an x has the colour of
     its slot and an o that of its object. Both edges of the result are even, as video needs.
@@ -98,21 +107,23 @@ def draw_frame(
     """
     num_panels = 1 + len(frame.attention)
     width = num_panels * panel_px + (num_panels + 1) * _MARGIN_PX
-    height = _TITLE_PX + panel_px + _STRIP_PX
+    top = _STRIP_PX + _TITLE_PX
+    title_y = _STRIP_PX + _TITLE_PX / 2
+    height = top + panel_px + _MARGIN_PX
     canvas = Image.new("RGB", (width + width % 2, height + height % 2), _BACKGROUND)
     draw = ImageDraw.Draw(canvas)
-    canvas.paste(_upscaled(frame.rgb, panel_px), (_MARGIN_PX, _TITLE_PX))
-    _draw_positions(draw, frame, (_MARGIN_PX, _TITLE_PX), panel_px)
+    canvas.paste(_upscaled(frame.rgb, panel_px), (_MARGIN_PX, top))
+    _draw_positions(draw, frame, (_MARGIN_PX, top), panel_px)
     crosses = "   x predicted  o true" if len(frame.uv_predicted) else ""
-    draw.text((_MARGIN_PX, _TITLE_PX / 2), f"wrist camera{crosses}", _TEXT, _font(13), anchor="lm")
+    draw.text((_MARGIN_PX, title_y), f"wrist camera{crosses}", _TEXT, _font(13), anchor="lm")
     for slot, attention in enumerate(frame.attention):
         left = _MARGIN_PX + (slot + 1) * (panel_px + _MARGIN_PX)
-        canvas.paste(Image.fromarray(attention_overlay(frame.rgb, attention, panel_px)), (left, _TITLE_PX))
+        canvas.paste(Image.fromarray(attention_overlay(frame.rgb, attention, panel_px)), (left, top))
         color = SLOT_COLORS[slot % len(SLOT_COLORS)]
-        draw.text((left, _TITLE_PX / 2), f"slot {slot}", color, _font(13), anchor="lm")
+        draw.text((left, title_y), f"slot {slot}", color, _font(13), anchor="lm")
         peak = f"peak {100 * float(attention.max()):.0f} %"
-        draw.text((left + panel_px, _TITLE_PX / 2), peak, _MUTED, _font(12), anchor="rm")
-    _draw_score(draw, frame, step, num_steps, episode_return, canvas.size)
+        draw.text((left + panel_px, title_y), peak, _MUTED, _font(12), anchor="rm")
+    _draw_score(draw, frame, step, num_steps, episode_return, canvas.width)
     return np.asarray(canvas)
 
 
@@ -146,10 +157,9 @@ def _draw_score(
     step: int,
     num_steps: int,
     episode_return: float,
-    size: tuple[int, int],
+    width: int,
 ) -> None:
-    width, height = size
-    middle = height - _STRIP_PX / 2 - 2
+    middle = (_STRIP_PX - 8) / 2
     text = f"step {step + 1}/{num_steps}    reward {frame.reward:5.3f}    return {episode_return:.1f}"
     if width < 480:
         text = f"{step + 1}/{num_steps}   r {frame.reward:4.2f}   R {episode_return:.0f}"
@@ -157,8 +167,8 @@ def _draw_score(
     if frame.success:
         draw.text((width - _MARGIN_PX, middle), "SOLVED", _SOLVED, _font(15), anchor="rm")
     right = _MARGIN_PX + (width - 2 * _MARGIN_PX) * (step + 1) / num_steps
-    draw.rectangle((_MARGIN_PX, height - 5, width - _MARGIN_PX, height - 3), fill=(50, 54, 60))
-    draw.rectangle((_MARGIN_PX, height - 5, right, height - 3), fill=_SOLVED if frame.success else _MUTED)
+    draw.rectangle((_MARGIN_PX, _STRIP_PX - 6, width - _MARGIN_PX, _STRIP_PX - 4), fill=(50, 54, 60))
+    draw.rectangle((_MARGIN_PX, _STRIP_PX - 6, right, _STRIP_PX - 4), fill=_SOLVED if frame.success else _MUTED)
 
 
 def write_video(
@@ -206,11 +216,9 @@ def _encode(frames: Sequence[RolloutFrame], path: Path, fps: int, panel_px: int,
         output_params=["-crf", str(compression), "-movflags", "+faststart"],
     ) as writer:
         for step, frame in enumerate(frames):
-            writer.append_data(
-                draw_frame(
-                    frame, step=step, num_steps=len(frames), episode_return=float(returns[step]), panel_px=panel_px
-                )
-            )
+            total = float(returns[step])
+            picture = draw_frame(frame, step=step, num_steps=len(frames), episode_return=total, panel_px=panel_px)
+            writer.append_data(picture)  # type: ignore[attr-defined]  # imageio's type leaves out what writers do
 
 
 def write_film_strip(frames: Sequence[RolloutFrame], path: Path, *, num_frames: int = 6, panel_px: int = 224) -> Path:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.learning import losses
+from slotfilm_dist.learning.checkpoint import plain_tensors
 from slotfilm_dist.messages import SampleBatch
 from slotfilm_dist.nets.interface import Encoder
 from slotfilm_dist.nets.policy_heads import Actor, TwinCritic, ValueNet
@@ -167,14 +168,14 @@ class SacLearner:
             "learner_actor_loss": actor_loss.detach(),
             "learner_q_mean": q.detach().mean(),
             "learner_target_mean": target.mean(),
-            "learner_policy_entropy_nats": -log_prob.detach().mean(),
+            "learner_entropy_nats": -log_prob.detach().mean(),
             "learner_temperature": temperature,
         } | {name: _gradient_norm(list(parameters)) for name, parameters in norms.items()}
 
     def metrics(self) -> dict[str, float]:
         """The latest measurements, by the metric catalogue's names."""
         values = {name: float(value) for name, value in self._metrics.items()}
-        return values | {"learner_updates_total": self.updates, "learner_skipped_updates_total": self.skipped_updates}
+        return values | {"learner_updates_total": self.updates, "learner_nonfinite_total": self.skipped_updates}
 
     def acting_arrays(self) -> dict[str, np.ndarray]:
         """What a worker needs to act: actor and the encoder's parts that RL changes."""
@@ -215,8 +216,11 @@ class SacLearner:
                 tensors |= {f"{name}.{index}.{key}": value for key, value in state.items()}
         tensors["log_temperature"] = self.log_temperature
         tensors["noise_state"] = self._noise.get_state()
-        plain = {name: value.detach().cpu().clone().contiguous() for name, value in tensors.items()}
-        return {"tensors": plain, "updates": self.updates, "skipped_updates": self.skipped_updates}
+        return {
+            "tensors": plain_tensors(tensors),
+            "updates": self.updates,
+            "skipped_updates": self.skipped_updates,
+        }
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state.

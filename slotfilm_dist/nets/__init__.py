@@ -11,6 +11,7 @@ queries     queries of one attention, slots or anything else
 rows        heads times queries, the queries of one head side by side
 heads       attention heads
 head_dim    channels of one head, dim / heads
+stacked     heads times dim, the averaged tokens of all heads side by side
 objects     objects whose projected positions supervise the slots, N_o
 assignments one-to-one assignments of objects to slots
 frames      frames of a data set

@@ -101,7 +101,7 @@ class FoldedSlotAttention(nn.Module):
     def _key_weight(self) -> Float[Tensor, "heads head_dim dim"]:
         return self.in_proj_weight[self.dim : 2 * self.dim].unflatten(0, (self.num_heads, -1))
 
-    def _value_map(self) -> tuple[Float[Tensor, "heads*dim dim"], Float[Tensor, " dim"]]:
+    def _value_map(self) -> tuple[Float[Tensor, "stacked dim"], Float[Tensor, " dim"]]:
         """Matrix and bias that take every head's averaged token to the output."""
         value = self.in_proj_weight[2 * self.dim :].unflatten(0, (self.num_heads, -1))
         out = self.out_proj.weight.unflatten(1, (self.num_heads, -1))

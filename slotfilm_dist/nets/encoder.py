@@ -124,10 +124,9 @@ class SlotFusionEncoder(nn.Module):
     ) -> Float[Tensor, "batch dim"]:
         """Slots and goal mixed by the softmax gate of Section 4.1.3; slots alone while the goal is out of view."""
         in_view = goal[:, 2:] > 0.5
-        uv = torch.where(in_view, goal[:, :2], 0.5)
         bias = torch.where(in_view, 0.0, self.config.goal_out_of_view_bias)
         shares = (gate_logits + torch.cat((torch.zeros_like(bias), bias), dim=1)).softmax(1)
-        return shares[:, :1] * pooled + shares[:, 1:] * perception.goal_feature(tokens, uv)
+        return shares[:, :1] * pooled + shares[:, 1:] * perception.goal_feature(tokens, goal[:, :2])
 
     @torch.no_grad()
     def set_state_statistics(self, mean: Float[Tensor, " proprio"], std: Float[Tensor, " proprio"]) -> None:

@@ -1,7 +1,6 @@
 """From a picture to slots: backbone, tokens, slot attention and the heads of pre-training (Sections 4.1 and 4.3)."""
 
 from dataclasses import dataclass
-from typing import Self
 
 import torch
 import torch.nn.functional as F
@@ -74,7 +73,10 @@ class PerceptionNetwork(nn.Module):
     def goal_feature(
         self, tokens: Float[Tensor, "batch tokens dim"], uv: Float[Tensor, "batch 2"]
     ) -> Float[Tensor, "batch dim"]:
-        """Output of a query that is the feature map's value at the goal, interpolated bilinearly (Section 4.1.1)."""
+        """Output of a query that is the feature map's value at the goal, interpolated bilinearly (Section 4.1.1).
+
+        A position outside the picture, or one that is not finite, is taken to the border.
+        """
         feature_map = tokens.transpose(1, 2).unflatten(2, (self.grid_size, self.grid_size))
         where = (2.0 * uv - 1.0).view(-1, 1, 1, 2)
         query = F.grid_sample(feature_map, where, padding_mode="border", align_corners=False).flatten(1)
@@ -86,7 +88,7 @@ class PerceptionNetwork(nn.Module):
         self.backbone.eval().requires_grad_(False)
         self.projection.requires_grad_(False)
 
-    def train(self, mode: bool = True) -> Self:
+    def train(self, mode: bool = True) -> "PerceptionNetwork":
         """Switch the mode of everything that is not frozen."""
         super().train(mode)
         if self.frozen:

@@ -1,5 +1,6 @@
 """The networks of Soft Actor-Critic on top of a latent: actor, twin critics, value network (Section 4.4, Table A1)."""
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -22,14 +23,19 @@ class EnsembleMLP(nn.Module):
     """
 
     def __init__(
-        self, members: int, sizes: tuple[int, ...], *, layer_norm: bool = False, generator: torch.Generator | None = None
+        self,
+        members: int,
+        sizes: tuple[int, ...],
+        *,
+        layer_norm: bool = False,
+        generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
         self.scales = nn.ParameterList()
         self.shifts = nn.ParameterList()
-        for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
+        for fan_in, fan_out in itertools.pairwise(sizes):
             bound = 1 / math.sqrt(fan_in)
             self.weights.append(nn.Parameter(_uniform((members, fan_in, fan_out), bound, generator)))
             self.biases.append(nn.Parameter(_uniform((members, 1, fan_out), bound, generator)))

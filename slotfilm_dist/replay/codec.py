@@ -46,7 +46,7 @@ def encode(value: Any) -> bytes:
         ValueError: a value of another kind, an array of objects, an int that is too large, or too deep a nesting.
     """
     try:
-        return msgpack.packb(_plain(value, 0), use_bin_type=True, strict_types=True)
+        return msgpack.Packer(use_bin_type=True, strict_types=True).pack(_plain(value, 0))
     except (TypeError, OverflowError) as error:
         raise ValueError(f"cannot be written: {error}") from None
 
@@ -91,9 +91,9 @@ def _encode_array(array: np.ndarray) -> msgpack.ExtType:
     return msgpack.ExtType(_ARRAY_CODE, header + array.astype(little, copy=False).tobytes())
 
 
-def _decode_array(code: int, payload: bytes) -> np.ndarray:
+def _decode_array(_code: int, payload: bytes) -> np.ndarray:
     dtype_index, num_axes = struct.unpack_from("<BB", payload)
-    if code != _ARRAY_CODE or dtype_index >= len(_DTYPES) or num_axes > MAX_AXES:
+    if dtype_index >= len(_DTYPES) or num_axes > MAX_AXES:
         raise ValueError("an array of unknown type")
     dtype = _DTYPES[dtype_index]
     shape: tuple[int, ...] = struct.unpack_from(f"<{num_axes}Q", payload, 2)
@@ -140,14 +140,18 @@ def _skip(content: bytes, position: int) -> tuple[int, int]:
     """Position behind a value's own bytes, and how many values it contains."""
     tag = content[position]
     position += 1
-    if tag <= 0x7F or tag >= 0xE0 or 0x80 <= tag <= 0x9F:
-        return position, (2 if tag < 0x90 else 1) * (tag & 0x0F) if 0x80 <= tag <= 0x9F else 0
-    if 0xA0 <= tag <= 0xBF:
+    if tag <= 0x7F or tag >= 0xE0:  # small ints
+        return position, 0
+    if tag <= 0x8F:  # short mapping
+        return position, 2 * (tag & 0x0F)
+    if tag <= 0x9F:  # short list
+        return position, tag & 0x0F
+    if tag <= 0xBF:  # short string
         return position + (tag & 0x1F), 0
     if tag in _FIXED_BYTES:
         return position + _FIXED_BYTES[tag], 0
     if tag in _FIXED_EXT_BYTES:
-        return position + 1 + _FIXED_EXT_BYTES[tag], 0
+        return _skip_array(content, position, _FIXED_EXT_BYTES[tag]), 0
     if tag not in _LENGTH_FORMATS:
         raise ValueError(f"unknown type 0x{tag:02x} at byte {position - 1}")
     length = struct.unpack_from(_LENGTH_FORMATS[tag], content, position)[0]
@@ -156,4 +160,12 @@ def _skip(content: bytes, position: int) -> tuple[int, int]:
         return position, 2 * length
     if tag in _ARRAY:
         return position, length
-    return position + length + (1 if tag in _EXT else 0), 0
+    if tag in _EXT:
+        return _skip_array(content, position, length), 0
+    return position + length, 0
+
+
+def _skip_array(content: bytes, position: int, num_bytes: int) -> int:
+    if content[position] != _ARRAY_CODE:
+        raise ValueError(f"an extension of unknown type {content[position]} at byte {position}")
+    return position + 1 + num_bytes

@@ -1,11 +1,12 @@
-"""Writes a `FrameDataset` block by block, so that a crash costs the last few blocks and never leaves a wrong dataset."""
+"""Writes a `FrameDataset` block by block; a crash costs the last few blocks and never leaves a wrong dataset."""
 
+import contextlib
 import hashlib
 import json
 import os
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -14,9 +15,6 @@ from slotfilm_dist.config import check, to_dict
 from slotfilm_dist.messages import TransitionBlock
 from slotfilm_dist.replay.dataset import FORMAT, MANIFEST, PROGRESS, dataset_columns
 from slotfilm_dist.replay.schema import Column, ReplaySchema
-
-COMMIT_ROWS = 4096
-"""Rows after which everything is flushed to the disk and noted as done; a crash costs at most so many."""
 
 _HEADER_BYTES = 256
 
@@ -36,12 +34,15 @@ class FrameDatasetWriter:
         directory: created if missing.
         schema: pictures or no camera, with labels.
         config_hash: hash of the config fields that the frames depend on.
+        commit_rows: rows after which all files are flushed to the disk; a crash costs at most so many.
 
     Raises:
         ValueError: the directory holds a finished dataset, or an unfinished one of another config or schema.
     """
 
-    def __init__(self, directory: Path, schema: ReplaySchema, config_hash: str) -> None:
+    def __init__(self, directory: Path, schema: ReplaySchema, config_hash: str, *, commit_rows: int = 4096) -> None:
+        check(commit_rows > 0, "commit_rows", commit_rows, "must be greater than 0")
+        self._commit_rows = commit_rows
         self._directory = directory
         self._schema = schema
         self._columns = dataset_columns(schema)
@@ -53,7 +54,7 @@ class FrameDatasetWriter:
         self._files = {name: self._open_column(name, column) for name, column in self._columns.items()}
         self._commit()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "FrameDatasetWriter":
         return self
 
     def __exit__(
@@ -78,7 +79,7 @@ class FrameDatasetWriter:
         self.num_rows += block.num_rows
         self.num_steps += block.num_steps
         self.num_episodes = self._episodes.count
-        if self.num_rows - self._committed_rows >= COMMIT_ROWS:
+        if self.num_rows - self._committed_rows >= self._commit_rows:
             self._commit()
 
     def finish(self) -> None:
@@ -101,8 +102,9 @@ class FrameDatasetWriter:
 
     def close(self) -> None:
         """Close the files; what was appended since the last commit is given up unless `finish` was called."""
-        for file in self._files.values():
-            file.close()
+        with contextlib.ExitStack() as stack:
+            for file in self._files.values():
+                stack.callback(file.close)
 
     def _read_progress(self) -> tuple[int, int, int]:
         path = self._directory / PROGRESS

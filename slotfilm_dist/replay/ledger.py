@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from slotfilm_dist.config import check
-from slotfilm_dist.messages import TransitionBlock
 
 MAX_EARLY_BLOCKS = 1024
 """Blocks remembered beyond a gap; when there are more, the gap is given up."""
@@ -74,34 +73,34 @@ class BlockLedger:
         """Blocks that later ones of the same worker have overtaken and that are still missing."""
         return self._num_given_up + sum(log.num_missing() for logs in self._logs.values() for log in logs.values())
 
-    def has(self, block: TransitionBlock) -> bool:
+    def has(self, worker_id: int, incarnation: int, sequence: int) -> bool:
         """Whether the block was recorded before.
 
         Raises:
             ValueError: the block belongs to another shard, or a number that cannot be negative is.
         """
-        check(block.sequence >= 0, "sequence", block.sequence, "counts from 0")
-        check(block.incarnation >= 0, "incarnation", block.incarnation, "counts from 0")
-        owner = shard_of(block.worker_id, block.sequence, self.num_shards)
+        check(sequence >= 0, "sequence", sequence, "counts from 0")
+        check(incarnation >= 0, "incarnation", incarnation, "counts from 0")
+        owner = shard_of(worker_id, sequence, self.num_shards)
         if owner != self.index:
             raise ValueError(
-                f"block {block.sequence} of worker {block.worker_id} belongs to shard {owner} of {self.num_shards}, "
+                f"block {sequence} of worker {worker_id} belongs to shard {owner} of {self.num_shards}, "
                 f"not to shard {self.index}; choose the shard with shard_of"
             )
-        if block.incarnation <= self._newest_forgotten.get(block.worker_id, -1):
+        if incarnation <= self._newest_forgotten.get(worker_id, -1):
             return True
-        log = self._logs.get(block.worker_id, {}).get(block.incarnation)
-        return log is not None and log.has(block.sequence // self.num_shards)
+        log = self._logs.get(worker_id, {}).get(incarnation)
+        return log is not None and log.has(sequence // self.num_shards)
 
-    def record(self, block: TransitionBlock) -> None:
+    def record(self, worker_id: int, incarnation: int, sequence: int) -> None:
         """Note that a block, which `has` denied, is stored now."""
-        logs = self._logs.setdefault(block.worker_id, {})
-        log = logs.setdefault(block.incarnation, _Log())
-        self._num_given_up += log.add(block.sequence // self.num_shards)
+        logs = self._logs.setdefault(worker_id, {})
+        log = logs.setdefault(incarnation, _Log())
+        self._num_given_up += log.add(sequence // self.num_shards)
         while len(logs) > MAX_INCARNATIONS:
             oldest = min(logs)
             self._num_given_up += logs.pop(oldest).num_missing()
-            self._newest_forgotten[block.worker_id] = oldest
+            self._newest_forgotten[worker_id] = oldest
 
     def save(self) -> dict[str, Any]:
         """The state: one row a log (worker, incarnation, mark), one an early block (worker, incarnation, number)."""

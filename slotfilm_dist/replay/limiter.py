@@ -47,8 +47,10 @@ class RateLimiter:
         check(min_steps >= 0, "min_steps", min_steps, "must be 0 or more")
         check(slack_updates >= 0, "slack_updates", slack_updates, "must be 0 or more")
         check(slack_steps > 0, "slack_steps", slack_steps, "must be greater than 0")
-        # Through the decimal form, so that 0.1 means a tenth and no rounding ever blocks a step that is due.
+        # Through the decimal form, so that 0.1 means a tenth and no rounding ever blocks a step that is due. Below,
+        # updates are counted in parts of which `_update_parts` make one and a step owes `_step_parts`, all ints.
         self._ratio = Fraction(str(updates_per_step))
+        self._step_parts, self._update_parts = self._ratio.as_integer_ratio()
         self._min_steps = min_steps
         self._slack_updates = slack_updates
         self._slack_steps = slack_steps
@@ -118,9 +120,9 @@ class RateLimiter:
             self._changed.notify_all()
 
     def updates_owed(self) -> int:
-        """Updates that the steps counted so far ask for and that have not happened; the loop of sync mode does these."""
+        """Updates that the steps counted so far ask for and that are still to come; sync mode makes just these."""
         with self._changed:
-            return max(0, int(self._debt())) if self._learning else 0
+            return max(0, self._debt_parts() // self._update_parts) if self._learning else 0
 
     def may_insert(self, num_steps: int) -> bool:
         """Whether steps would be granted now; counts nothing."""
@@ -225,16 +227,17 @@ class RateLimiter:
             self._waited_insert_s, self._waited_update_s = state["waited_insert_s"], state["waited_update_s"]
             self._changed.notify_all()
 
-    def _debt(self) -> Fraction:
-        """Updates owed; negative while the learner is ahead."""
-        return (self._env_steps - self._base_steps) * self._ratio - (self._updates - self._base_updates)
+    def _debt_parts(self) -> int:
+        """Parts of updates owed; negative while the learner is ahead."""
+        steps, updates = self._env_steps - self._base_steps, self._updates - self._base_updates
+        return steps * self._step_parts - updates * self._update_parts
 
     def _insert_fits(self, num_steps: int) -> bool:
-        return not self._learning or self._debt() + num_steps * self._ratio <= self._slack_steps * self._ratio
+        return not self._learning or self._debt_parts() <= (self._slack_steps - num_steps) * self._step_parts
 
     def _update_fits(self, num_updates: int) -> bool:
         ready = self._learning and self._env_steps >= self._base_steps
-        return ready and num_updates <= self._debt() + self._slack_updates
+        return ready and (num_updates - self._slack_updates) * self._update_parts <= self._debt_parts()
 
     def _wait(self, fits: Callable[[], bool], timeout_s: float) -> float:
         began_s = time.monotonic()
@@ -244,6 +247,10 @@ class RateLimiter:
     def _check_sizes(self, *, num_steps: int = 1, num_updates: int = 1) -> None:
         check(num_steps > 0, "num_steps", num_steps, "must be greater than 0")
         check(num_updates > 0, "num_updates", num_updates, "must be greater than 0")
+        if not self._learning:  # nothing is held back yet, so nothing can wait for ever
+            return
+        if not self._learning:
+            return  # nothing is held back yet, so nothing can wait
         insert, update = max(self._largest_insert, num_steps), max(self._largest_update, num_updates)
         # Both sides can wait at once only if one request of each is larger than the two slacks together.
         needed = math.ceil(insert + (update - self._slack_updates) / self._ratio)
@@ -259,10 +266,12 @@ class RateLimiter:
     def _insert_waits_for(self, num_steps: int) -> str:
         if self._closed:
             return "nothing: the limiter is closed"
-        excess = self._debt() + (num_steps - self._slack_steps) * self._ratio
+        excess_parts = self._debt_parts() + (num_steps - self._slack_steps) * self._step_parts
+        needed = -(-excess_parts // self._update_parts)
+        steps, updates = self._env_steps - self._base_steps, self._updates - self._base_updates
         return (
-            f"{math.ceil(excess)} more updates: the workers are {self._env_steps - self._base_steps} steps into learning, "
-            f"the learner made {self._updates - self._base_updates} updates (target {float(self._ratio):g} per step)"
+            f"{needed} more updates; since learning began there were {steps} steps and {updates} updates, "
+            f"the target is {float(self._ratio):g} updates per step"
         )
 
     def _update_waits_for(self, num_updates: int) -> str:
@@ -270,6 +279,9 @@ class RateLimiter:
             return "nothing: the limiter is closed"
         if not self._learning:
             return f"learning to start; {self._env_steps} environment steps so far"
-        missing = (num_updates - self._slack_updates - self._debt()) / self._ratio
-        missing = max(missing, self._base_steps - self._env_steps)
-        return f"{math.ceil(missing)} more environment steps; {self._env_steps} so far, learning began at {self._base_steps}"
+        missing_parts = (num_updates - self._slack_updates) * self._update_parts - self._debt_parts()
+        missing_steps = max(-(-missing_parts // self._step_parts), self._base_steps - self._env_steps)
+        return (
+            f"{missing_steps} more environment steps; there were {self._env_steps} so far, "
+            f"and learning begins at {self._base_steps}"
+        )

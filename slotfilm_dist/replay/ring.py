@@ -68,24 +68,24 @@ class RowRing:
         return self.num_rows * self.schema.row_bytes + self._step_rows.nbytes + self._step_versions.nbytes
 
     def insert(self, block: TransitionBlock) -> None:
-        """Store a valid block over the oldest rows; raises ``ValueError`` if it is larger than the whole ring."""
-        if block.num_rows > self.num_rows or block.num_steps > self.capacity_steps:
-            raise ValueError(
-                f"a block of {block.num_steps} steps in {block.num_rows} rows does not fit a ring of "
-                f"{self.capacity_steps} steps in {self.num_rows} rows; raise replay.capacity or send smaller blocks"
-            )
-        new_steps = np.flatnonzero(block.is_step) + self._next_row
-        self._forget(oldest_row=self._next_row + block.num_rows - self.num_rows, num_new_steps=len(new_steps))
+        """Store a valid block over the oldest rows; of one larger than the ring only the newest steps."""
+        new_steps = np.flatnonzero(block.is_step)[-self.capacity_steps :]
+        skipped = max(0, block.num_rows - self.num_rows)
+        if len(new_steps) == self.capacity_steps:
+            skipped = max(skipped, int(new_steps[0]))
+        new_steps = new_steps[new_steps >= skipped] + self._next_row - skipped
+        num_rows = block.num_rows - skipped
+        self._forget(oldest_row=self._next_row + num_rows - self.num_rows, num_new_steps=len(new_steps))
         start = self._next_row % self.num_rows
-        head = min(block.num_rows, self.num_rows - start)
+        head = min(num_rows, self.num_rows - start)
         for name, column in self._columns.items():
-            value = getattr(block, name)
+            value = getattr(block, name)[skipped:]
             column[start : start + head] = value[:head]
-            column[: block.num_rows - head] = value[head:]
+            column[: num_rows - head] = value[head:]
         slots = np.arange(self._next_step, self._next_step + len(new_steps)) % self.capacity_steps
         self._step_rows[slots] = new_steps
         self._step_versions[slots] = block.policy_version
-        self._next_row += block.num_rows
+        self._next_row += num_rows
         self._next_step += len(new_steps)
 
     def _forget(self, *, oldest_row: int, num_new_steps: int) -> None:
@@ -192,7 +192,7 @@ class RowRing:
             _check_array(state["columns"][name], column[:used_rows], f"ring.columns.{name}")
         stored = state["step_rows"][np.arange(first_step, next_step) % self.capacity_steps]
         ascending = bool((np.diff(stored) > 0).all())
-        inside = len(stored) == 0 or (stored[0] >= max(0, next_row - self.num_rows) and stored[-1] < next_row - 1)
+        inside = bool((stored >= max(0, next_row - self.num_rows)).all() and (stored < next_row - 1).all())
         check(ascending and inside, "ring.step_rows", len(stored), "step rows out of order or outside the ring")
 
 

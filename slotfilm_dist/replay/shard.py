@@ -73,12 +73,13 @@ class ReplayShard:
         Raises:
             ValueError: the block does not fit the schema, holds values that are not finite, or is another shard's.
         """
-        if self._ledger.has(block):
+        key = block.worker_id, block.incarnation, block.sequence
+        if self._ledger.has(*key):
             self._duplicate_blocks += 1
             return False
         self.schema.validate(block)
         self._ring.insert(block)
-        self._ledger.record(block)
+        self._ledger.record(*key)
         self._inserted_steps += block.num_steps
         self._inserted_blocks += 1
         return True

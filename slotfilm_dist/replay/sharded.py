@@ -1,5 +1,6 @@
 """Several shards as one replay: blocks go to their shard, draws are uniform over all stored steps."""
 
+import copy
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
@@ -78,8 +79,12 @@ class ShardedReplay:
 
     def save(self) -> dict[str, Any]:
         """The state of every shard, copied, and of the stream that splits draws among them."""
+        return copy.deepcopy(self.view())
+
+    def view(self) -> dict[str, Any]:
+        """The state of `save` without copying; valid until the next insert. For `snapshot.write_snapshot`."""
         return {
-            "shards": [shard.save() for shard in self._shards],
+            "shards": {f"shard{index}": shard.view() for index, shard in enumerate(self._shards)},
             "rng": json.dumps(self._rng.bit_generator.state),
         }
 
@@ -87,6 +92,6 @@ class ShardedReplay:
         """Take over a saved state; raises ``ValueError`` if it does not fit."""
         saved = state["shards"]
         check(len(saved) == len(self._shards), "shards", len(saved), f"this replay has {len(self._shards)}")
-        for shard, shard_state in zip(self._shards, saved, strict=True):
-            shard.load(shard_state)
+        for index, shard in enumerate(self._shards):
+            shard.load(saved[f"shard{index}"])
         self._rng.bit_generator.state = json.loads(state["rng"])

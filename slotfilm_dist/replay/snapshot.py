@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from slotfilm_dist.atomic import TEMPORARY_SUFFIX, FileDigest, check_file, write_atomic
-from slotfilm_dist.config import to_dict
+from slotfilm_dist.config import check, to_dict
 from slotfilm_dist.replay.codec import decode, encode
 
 MANIFEST = "manifest.json"
@@ -36,10 +36,9 @@ def write_snapshot(directory: Path, state: Mapping[str, Any]) -> None:
         OSError: the disk is full or not writable; the previous snapshot stays and nothing of the new one is left.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    previous = _read_manifest(directory) if (directory / MANIFEST).exists() else None
-    kept = set(previous["files"]) if previous else set()
+    generation, kept = _previous(directory)
     _remove_files(directory, kept)
-    generation = previous["generation"] + 1 if previous else 0
+    generation += 1
     arrays: dict[str, np.ndarray] = {}
     rest = _take_arrays(state, "", arrays)
     try:
@@ -89,6 +88,7 @@ def _take_arrays(state: Mapping[str, Any], prefix: str, arrays: dict[str, np.nda
     """The state without its large arrays, which are collected under their dotted path."""
     rest: dict[str, Any] = {}
     for key, value in state.items():
+        check(key.isidentifier(), "state", prefix + key, "keys become file names and must be identifiers")
         if isinstance(value, np.ndarray) and value.nbytes >= LARGE_BYTES:
             arrays[prefix + key] = value
         elif isinstance(value, Mapping):
@@ -125,6 +125,15 @@ def _read_manifest(directory: Path) -> dict[str, Any]:
     if manifest["format"] != FORMAT:
         raise ValueError(f"{path} has format {manifest['format']}, this version reads {FORMAT}")
     return manifest
+
+
+def _previous(directory: Path) -> tuple[int, set[str]]:
+    """Generation and files of the last snapshot; one that cannot be read is not worth keeping."""
+    try:
+        manifest = _read_manifest(directory)
+    except ValueError:
+        return 0, set()
+    return manifest["generation"], set(manifest["files"])
 
 
 def _remove_files(directory: Path, kept: set[str]) -> None:

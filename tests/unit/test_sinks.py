@@ -60,7 +60,9 @@ def test_axis_left_out_keeps_its_last_value_also_over_a_resume(tmp_path):
     assert axes == [(1.5, 7, 3, "train"), (1.5, 7, 3, "train"), (1.5, 7, 4, "train")]
 
 
-@pytest.mark.parametrize("torn", [b'{"time_s": 1, "env_', b'{"time_s": 1}\x00\x00\n', b"\x00" * 9 + b"\n", b"\xff\xfe\n"])
+@pytest.mark.parametrize(
+    "torn", [b'{"time_s": 1, "env_', b'{"time_s": 1}\x00\x00\n', b"\x00" * 9 + b"\n", b"\xff\xfe\n"]
+)
 def test_torn_last_line_is_cut_off_when_resuming(tmp_path, torn):
     path = tmp_path / "metrics.jsonl"
     JsonLinesSink(path).write({"env_steps": 1})
@@ -202,7 +204,7 @@ def test_failing_sink_never_stops_the_others_and_warns_once(tmp_path, caplog):
     assert broken.writes == 3
     assert sink.num_failures == [3, 0]
     assert [line["env_steps"] for line in lines_of(path)] == [0, 1, 2]
-    assert lines_of(path)[-1]["sink_failures_total"] == 3
+    assert lines_of(path)[-1]["sink_failures_total"] == 2
 
 
 def test_fan_out_refuses_an_unknown_name_before_it_writes(tmp_path):

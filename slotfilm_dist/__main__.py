@@ -1,0 +1,68 @@
+"""The command line: `slotfilm COMMAND`, also `python -m slotfilm_dist COMMAND`."""
+
+import importlib
+import sys
+import traceback
+from collections.abc import Sequence
+
+from slotfilm_dist import __version__
+
+COMMANDS: dict[str, tuple[str, str]] = {
+    "doctor": ("commands.doctor:main", "what this machine can do, and a fix for each lack"),
+    "train": ("commands.train:main", "a run from nothing to its report, or on with --resume"),
+    "evaluate": ("commands.evaluate:main", "episodes on held-out seeds: trained agent, expert or random policy"),
+    "report": ("commands.report:main", "write the page of a run"),
+    "variants": ("commands.listing:variants", "the agents of the study, the tasks, the presets"),
+    "cost": ("commands.listing:cost", "parameters, latency and memory of every variant"),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; gives its exit code: 0 done, 1 failed, 2 the user's mistake, 128 + n stopped by signal n."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
+    if not words or words[0] in ("-h", "--help"):
+        print(_help())
+        return 0
+    if words[0] == "--version":
+        print(f"slotfilm {__version__}")
+        return 0
+    try:
+        return _command(words[0])(words[1:])
+    except ValueError as error:
+        if debug:
+            traceback.print_exc()
+        print(f"slotfilm: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("slotfilm: stopped", file=sys.stderr)
+        return 130
+
+
+def _command(name: str):  # noqa: ANN202  a function of the command's module
+    if name not in COMMANDS:
+        import difflib
+
+        near = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else "see `slotfilm --help`"
+        raise ValueError(f"{name!r} is no command; {hint}")
+    module, _, function = COMMANDS[name][0].partition(":")
+    return getattr(importlib.import_module(f"slotfilm_dist.{module}"), function)
+
+
+def _help() -> str:
+    lines = [f"  {name:<10} {text}" for name, (_, text) in COMMANDS.items()]
+    return "\n".join(
+        [
+            f"slotfilm {__version__}: egocentric manipulation with state-guided slots",
+            "",
+            "usage: slotfilm COMMAND [OPTIONS]     (each command has --help; --debug shows where an error came from)",
+            "",
+            *lines,
+        ]
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,73 @@
+"""What a run needs of the place where its roles live: one process, or a Ray cluster."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from slotfilm_dist.messages import EpisodeSummary, TransitionBlock
+
+Player = Literal["random", "expert", "agent"]
+"""Who acts in an evaluation; `agent` is the learner's newest weights, acting deterministically."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrainReport:
+    """What happened since the last report."""
+
+    env_steps: int
+    """Environment steps of the run so far."""
+    updates: int
+    """Updates so far."""
+    metrics: Mapping[str, float]
+    """Values by the metric catalogue's names."""
+    episodes: tuple[tuple[EpisodeSummary, int], ...] = field(default=())
+    """Training episodes that ended, each with the version of the weights that acted."""
+
+
+class Backend(Protocol):
+    """The roles of one run. Every method that takes long gives control back regularly, so that a run can be stopped."""
+
+    action_dim: int
+    reward_term_names: tuple[str, ...]
+
+    def random_blocks(self, num_steps: int, start: int) -> Iterator[TransitionBlock]:
+        """Blocks of the random policy, `num_steps` steps or a little more, after `start` steps that are there."""
+        ...
+
+    def pretrain(self, dataset: Path, artifact: Path) -> Iterator[dict[str, float]]:
+        """Pre-train on a dataset and write the result as a checkpoint; gives metrics as it goes.
+
+        An interrupted pre-training continues from what it wrote beside the artifact.
+        """
+        ...
+
+    def begin_training(self, dataset: Path, pretrained: Path | None, resume_from: Path | None) -> dict[str, Any]:
+        """Build the learner and fill replay; gives the plain values that the resumed checkpoint was written with.
+
+        Args:
+            dataset: the random policy's data.
+            pretrained: checkpoint of the pre-trained encoder; None without pre-training.
+            resume_from: folder of the run's checkpoints; None for a fresh start.
+        """
+        ...
+
+    def train(self, should_stop: Callable[[], bool]) -> Iterator[TrainReport]:
+        """Train until the schedule's end, or until `should_stop`, reporting a few times a second."""
+        ...
+
+    def play(self, player: Player, seeds: Sequence[int]) -> Iterator[EpisodeSummary]:
+        """Play episodes on held-out seeds."""
+        ...
+
+    def record(self, player: Player, seed: int, video: Path, film_strip: Path) -> EpisodeSummary:
+        """Play one episode and write its video and film strip."""
+        ...
+
+    def save(self, folder: Path, values: Mapping[str, Any], *, with_replay: bool, best: bool = False) -> int:
+        """Write a checkpoint, numbered or as `best`, and replay beside it; gives its size in bytes."""
+        ...
+
+    def close(self) -> None:
+        """Stop everything."""
+        ...

@@ -1,0 +1,1 @@
+"""The commands of `slotfilm`, one module each; imported only when called."""

@@ -1,0 +1,100 @@
+"""Turns a command line into a run's config: preset, then task, then variant, then single fields."""
+
+import argparse
+import contextlib
+import io
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NoReturn
+
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.presets import PRESETS, preset_named
+from slotfilm_dist.variants import VARIANTS, apply_variant
+
+FIELDS_NOTE = "Every field of the config is an option too, as in --sac.temperature 0.2; `--fields` lists them all."
+
+
+class Parser(argparse.ArgumentParser):
+    """Refuses with one sentence and exit code 2."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(f"{message}; see `{self.prog} --help`")
+
+
+def add_config_options(parser: argparse.ArgumentParser, preset: str) -> None:
+    """Preset, variant, seed and the note on fields."""
+    parser.add_argument(
+        "preset", nargs="?", default=preset, help=f"budget: {', '.join(PRESETS)} (default: %(default)s)"
+    )
+    parser.add_argument("--variant", default="", help=f"agent: {', '.join(VARIANTS)} (default: slotfilm)")
+    parser.add_argument("--fields", action="store_true", help="list every field of the config with its default")
+    parser.epilog = FIELDS_NOTE
+
+
+def build_config(preset: str, variant: str, fields: Sequence[str], *, show_fields: bool = False) -> RunConfig:
+    """The config that a command line asks for.
+
+    Args:
+        preset: name of the budget.
+        variant: name of the agent; empty for the preset's own.
+        fields: what remains of the command line, `--section.field value`.
+        show_fields: print every field and exit instead.
+
+    Raises:
+        ValueError: an unknown name (with the nearest known one) or an impossible value.
+    """
+    from slotfilm_dist.envs.tasks import adapt_config
+
+    base = preset_named(preset)
+    task = _value_of(fields, "--env.task")
+    if task:
+        base = replace(base, env=replace(base.env, task=task))
+    base = apply_variant(variant or base.variant, adapt_config(base))
+    return _parse_fields(base, ["--help"] if show_fields else list(fields))
+
+
+def _parse_fields(base: RunConfig, fields: list[str]) -> RunConfig:
+    import tyro
+
+    shown = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(shown):
+            return tyro.cli(RunConfig, default=base, args=fields, prog="slotfilm train", use_underscores=True)
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        raise ValueError(_refusal(fields, shown.getvalue())) from None
+
+
+def _refusal(fields: list[str], shown: str) -> str:
+    """One sentence of what tyro has to say in a box."""
+    import difflib
+
+    known = _field_names(RunConfig(), "")
+    for field in fields:
+        name = field.removeprefix("--").split("=")[0].replace("-", "_")
+        if field.startswith("--") and name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            return f"unknown field --{name}" + (f"; did you mean --{near[0]}?" if near else "; --fields lists them all")
+    lines = [line.strip(" |│╭╮╰╯─\n") for line in shown.splitlines()]
+    return " ".join(line for line in lines if line and "--help" not in line)
+
+
+def _field_names(config: object, where: str) -> list[str]:
+    import dataclasses
+
+    names: list[str] = []
+    for field in dataclasses.fields(config):  # type: ignore[arg-type]  # a config section
+        value = getattr(config, field.name)
+        name = where + field.name
+        names += _field_names(value, name + ".") if dataclasses.is_dataclass(value) else [name]
+    return names
+
+
+def _value_of(fields: Sequence[str], option: str) -> str:
+    for index, field in enumerate(fields):
+        if field.startswith(option + "="):
+            return field.split("=", 1)[1]
+        if field == option and index + 1 < len(fields):
+            return fields[index + 1]
+    return ""

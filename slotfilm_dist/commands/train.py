@@ -1,0 +1,74 @@
+"""`slotfilm train`: a run from nothing to its report, or on from where it stopped."""
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from slotfilm_dist.commands.options import Parser, add_config_options, build_config
+from slotfilm_dist.config import RunConfig
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Train; gives the exit code."""
+    parser = Parser(prog="slotfilm train", description="Collect, pre-train, train, evaluate; then write a report.")
+    add_config_options(parser, "quick")
+    parser.add_argument("--resume", metavar="DIR", help="go on with the run in this directory")
+    parser.add_argument("--runs", default="runs", metavar="DIR", help="where run directories go (default: %(default)s)")
+    parser.add_argument("--name", default="", help="name of the run directory (default: preset, variant, seed, number)")
+    parser.add_argument(
+        "--artifacts",
+        default="artifacts",
+        metavar="DIR",
+        help="data and encoders that runs share (default: %(default)s)",
+    )
+    parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
+    options, fields = parser.parse_known_args(arguments)
+
+    from slotfilm_dist.runs import RunDirectory, new_run_directory
+
+    if options.resume:
+        run = _resumed(Path(options.resume), fields)
+    else:
+        config = build_config(options.preset, options.variant, fields, show_fields=options.fields)
+        run = RunDirectory.create(new_run_directory(Path(options.runs), config, options.preset, options.name), config)
+    return _execute(run.path, run.config, Path(options.artifacts), as_json=options.json)
+
+
+def _resumed(path: Path, fields: Sequence[str]):  # noqa: ANN202  the type would import torch early
+    from slotfilm_dist.commands.options import _parse_fields
+    from slotfilm_dist.config import load_config
+    from slotfilm_dist.runs import RunDirectory
+
+    changes = _parse_fields(load_config(path / "config.json"), list(fields)) if fields else None
+    return RunDirectory.resume(path, changes)
+
+
+def _execute(path: Path, config: RunConfig, artifacts: Path, *, as_json: bool) -> int:
+    from slotfilm_dist.local import LocalBackend
+    from slotfilm_dist.pipeline import Interrupted, Pipeline, StopFlag
+    from slotfilm_dist.progress import Progress
+    from slotfilm_dist.runs import RunDirectory
+
+    progress, stop = Progress(), StopFlag()
+    with stop.listening(), RunDirectory(path, config) as run:
+        progress.say(f"slotfilm  {config.variant} on {config.env.task}, seed {config.seed}: {run.path}")
+        backend = LocalBackend(config)
+        try:
+            page = Pipeline(run, backend, artifacts, progress, stop).execute()
+        except Interrupted as interruption:
+            progress.say(f"{interruption}; go on with: slotfilm train --resume {run.path}")
+            return interruption.exit_code
+        finally:
+            progress.end()
+            backend.close()
+    progress.say(f"  report  {page}")
+    if as_json:
+        json.dump({"run": str(path), "report": str(page), **_result(path)}, sys.stdout)
+        print()
+    return 0
+
+
+def _result(path: Path) -> dict[str, object]:
+    values = json.loads((path / "evaluation" / "final.json").read_text(encoding="utf-8"))
+    return {name: values[name] for name in ("mean_return", "success_rate", "success_interval")}

@@ -1,0 +1,312 @@
+"""A run from nothing to its report: collect, pre-train, train, evaluate. The same for every backend."""
+
+import signal
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+
+from slotfilm_dist.backend import Backend, Player, TrainReport
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.evaluation.page import write_page
+from slotfilm_dist.evaluation.record import Evaluation, save_evaluation, summarize
+from slotfilm_dist.learning.learner import dataset_hash, dataset_schema, pretrain_hash
+from slotfilm_dist.messages import EpisodeSummary
+from slotfilm_dist.metrics import phase_index
+from slotfilm_dist.progress import Phase, Progress
+from slotfilm_dist.replay.dataset import MANIFEST
+from slotfilm_dist.replay.dataset_writer import FrameDatasetWriter
+from slotfilm_dist.runs import RunDirectory
+from slotfilm_dist.sinks import FanOut, JsonLinesSink, TensorBoardSink
+
+RECENT_EPISODES = 20
+"""Episodes that the shown return is averaged over."""
+POLICY_NAMES: dict[Player, str] = {"random": "random", "expert": "scripted expert", "agent": "trained, deterministic"}
+
+
+class Interrupted(Exception):
+    """A signal asked the run to stop; everything needed to go on has been written."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"stopped by {signal.Signals(number).name}")
+        self.exit_code = 128 + number
+
+
+class StopFlag:
+    """Remembers the first SIGINT or SIGTERM; a second one ends the process at once."""
+
+    def __init__(self) -> None:
+        self.signal_number = 0
+
+    def __call__(self) -> bool:
+        """Whether to stop."""
+        return self.signal_number != 0
+
+    def check(self) -> None:
+        """Raise `Interrupted` if a signal has come."""
+        if self.signal_number:
+            raise Interrupted(self.signal_number)
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Listen while the body runs."""
+
+        def remember(number: int, frame: FrameType | None) -> None:
+            if self.signal_number:
+                raise KeyboardInterrupt
+            self.signal_number = number
+
+        before = {number: signal.signal(number, remember) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+class Pipeline:
+    """Drives one run through its phases; each phase that is already done is skipped.
+
+    Args:
+        run: the entered run directory.
+        backend: where the roles live.
+        artifacts: folder of data and encoders that runs share.
+        progress: tells the user.
+        stop: asked between pieces of work.
+    """
+
+    def __init__(
+        self, run: RunDirectory, backend: Backend, artifacts: Path, progress: Progress, stop: StopFlag
+    ) -> None:
+        self._run = run
+        self._config: RunConfig = run.config
+        self._backend = backend
+        self._artifacts = artifacts
+        self._progress = progress
+        self._stop = stop
+        self._status = run.read_status()
+        self._sink = FanOut([JsonLinesSink(run.metrics), TensorBoardSink(run.path / "tensorboard")])
+        self._began = time.monotonic() - float(self._status.get("time_s", 0.0))
+        self._returns: deque[float] = deque(maxlen=RECENT_EPISODES)
+        self._solved: deque[bool] = deque(maxlen=RECENT_EPISODES)
+
+    def execute(self) -> Path:
+        """Do what is left to do; gives the report's path.
+
+        Raises:
+            Interrupted: a signal came; the run can be resumed.
+        """
+        try:
+            dataset = self._collect()
+            pretrained = self._pretrain(dataset)
+            self._train(dataset, pretrained)
+            self._evaluate()
+        finally:
+            self._sink.close()
+            page = write_page(self._run.path)
+        return page
+
+    def _collect(self) -> Path:
+        """The random policy's data, from the artifacts where they are there."""
+        config = self._config
+        folder = self._artifacts / f"random-{dataset_hash(config)}"
+        if (folder / MANIFEST).exists():
+            self._progress.say(f" collect  random-policy data is there: {folder}")
+            return folder
+        wanted = config.schedule.random_steps
+        self._progress.begin("collect", f"{wanted} steps of the random policy")
+        schema = dataset_schema(config, self._backend.action_dim)
+        started = time.monotonic()
+        with FrameDatasetWriter(folder, schema, dataset_hash(config)) as writer:
+            already = writer.num_steps
+            for block in self._backend.random_blocks(wanted - already, already) if already < wanted else ():
+                writer.append(block)
+                self._note_episodes([(e, -1) for e in block.episodes], writer.num_steps)
+                rate = (writer.num_steps - already) / (time.monotonic() - started)
+                self._progress.show(writer.num_steps, wanted, {"steps/s": f"{rate:.0f}"})
+                self._write("collect", writer.num_steps, 0, {"worker_env_steps_per_s": rate})
+                self._stop.check()
+            writer.finish()
+            self._progress.end(f"{writer.num_steps} steps")
+        return folder
+
+    def _pretrain(self, dataset: Path) -> Path | None:
+        config = self._config
+        if not config.encoder.uses_image or config.pretrain.steps == 0:
+            return None
+        folder = self._artifacts / f"encoder-{pretrain_hash(config)}"
+        if folder.exists():
+            self._progress.say(f"pretrain  the pre-trained encoder is there: {folder}")
+            return folder
+        total = config.pretrain.steps
+        self._progress.begin("pretrain", f"{total} gradient steps: positions, visibility, attention")
+        shown: dict[str, float] = {}
+        for metrics in self._backend.pretrain(dataset, folder):
+            shown |= metrics
+            self._progress.show(shown["pretrain_steps_total"], total, _pretrain_line(shown))
+            self._write("pretrain", config.schedule.random_steps, 0, metrics)
+            self._stop.check()
+        error, baseline = shown.get("pretrain_position_error_px"), shown.get("pretrain_baseline_error_px")
+        self._progress.end(
+            f"held-out position error {error:.1f} px, predicting the mean {baseline:.1f} px"
+            if error is not None and baseline is not None
+            else "done"
+        )
+        return folder
+
+    def _train(self, dataset: Path, pretrained: Path | None) -> None:
+        config = self._config
+        if self._status.get("trained"):
+            self._backend.begin_training(dataset, pretrained, self._run.checkpoints)
+            return
+        total = config.schedule.total_steps
+        self._progress.begin("train", f"{config.variant}: {total} environment steps in all")
+        resumed = self._run.checkpoints if any(self._run.checkpoints.glob("updates-*")) else None
+        values = self._backend.begin_training(dataset, pretrained, resumed)
+        self._best = float(values.get("best_return", float("-inf")))
+        next_evaluation = int(
+            values.get("next_evaluation", config.schedule.random_steps + config.evaluation.every_steps)
+        )
+        next_save = int(values.get("updates", 0)) + config.checkpoint.every_updates
+        report = TrainReport(env_steps=0, updates=0, metrics={})
+        for report in self._backend.train(self._stop):
+            self._note(report)
+            if config.evaluation.every_steps and next_evaluation <= report.env_steps < total and not self._stop():
+                self._evaluate_now(report)
+                next_evaluation = report.env_steps + config.evaluation.every_steps
+            if report.updates >= next_save:
+                self._save(report, next_evaluation, with_replay=False)
+                next_save = report.updates + config.checkpoint.every_updates
+        done = report.env_steps >= total
+        self._save(report, next_evaluation, with_replay=config.checkpoint.save_replay and not done, trained=done)
+        self._progress.end(f"{report.env_steps} steps, {report.updates} updates")
+        self._stop.check()
+
+    def _evaluate_now(self, report: TrainReport) -> None:
+        seeds = self._seeds(self._config.evaluation.during_episodes)
+        result = self._play(f"step-{report.env_steps}", "agent", seeds, report.env_steps)
+        self._write("train", report.env_steps, report.updates, self._evaluation_metrics(result))
+        if result.mean_return > self._best:
+            self._best = result.mean_return
+            self._backend.save(self._run.checkpoints, {"best_return": self._best}, with_replay=False, best=True)
+
+    def _save(self, report: TrainReport, next_evaluation: int, *, with_replay: bool, trained: bool = False) -> None:
+        values = {"next_evaluation": next_evaluation, "best_return": self._best, "env_steps": report.env_steps}
+        started = time.monotonic()
+        size = self._backend.save(self._run.checkpoints, values, with_replay=with_replay)
+        metrics = {"checkpoint_bytes": float(size), "checkpoint_write_s": time.monotonic() - started}
+        self._write("train", report.env_steps, report.updates, metrics)
+        self._run.write_status(
+            phase="train", env_steps=report.env_steps, updates=report.updates, trained=trained, time_s=self._time_s()
+        )
+
+    def _evaluate(self) -> None:
+        config = self._config
+        seeds = self._seeds(config.evaluation.episodes)
+        self._progress.begin("evaluate", f"{len(seeds)} episodes each: the random policy, the trained agent")
+        random = self._play("random", "random", seeds, 0)
+        final = self._play("final", "agent", seeds, config.schedule.total_steps)
+        self._write("evaluate", config.schedule.total_steps, 0, self._evaluation_metrics(final))
+        if config.encoder.uses_image:
+            for seed in seeds[: config.evaluation.videos]:
+                self._backend.record(
+                    "agent",
+                    seed,
+                    self._run.path / "videos" / f"agent-{seed}.mp4",
+                    self._run.path / "figures" / f"film-strip-{seed}.png",
+                )
+                self._stop.check()
+        low, high = final.success_interval
+        self._progress.end(
+            f"return {final.mean_return:.1f} against {random.mean_return:.1f} at random on the same seeds; "
+            f"success {final.success_rate:.0%} [{low:.0%}, {high:.0%}]"
+        )
+        self._run.write_status(phase="done", trained=True, time_s=self._time_s())
+
+    def _play(self, name: str, player: Player, seeds: list[int], env_steps: int) -> Evaluation:
+        episodes: list[EpisodeSummary] = []
+        for episode in self._backend.play(player, seeds):
+            episodes.append(episode)
+            mean = np.mean([e.episode_return for e in episodes])
+            self._progress.show(len(episodes), len(seeds), {"policy": player, "return": f"{mean:.1f}"})
+            self._stop.check()
+        result = summarize(name, POLICY_NAMES[player], env_steps, tuple(episodes), self._backend.reward_term_names)
+        save_evaluation(result, self._run.path)
+        return result
+
+    def _seeds(self, count: int) -> list[int]:
+        first = self._config.evaluation.seed
+        return list(range(first, first + count))
+
+    def _evaluation_metrics(self, result: Evaluation) -> dict[str, float]:
+        return {
+            "eval_return": result.mean_return,
+            "eval_return_scaled": result.mean_return * self._config.sac.reward_scale,
+            "eval_return_std": result.std_return,
+            "eval_success_rate": result.success_rate,
+            "eval_success_once_rate": float(np.mean([e.success_once for e in result.episodes])),
+        }
+
+    def _note(self, report: TrainReport) -> None:
+        """Write a report's numbers and show them."""
+        self._note_episodes(report.episodes, report.env_steps)
+        self._write("train", report.env_steps, report.updates, report.metrics)
+        values = {
+            "steps/s": f"{report.metrics.get('worker_env_steps_per_s', 0):.0f}",
+            "updates/s": f"{report.metrics.get('learner_updates_per_s', 0):.0f}",
+        }
+        if self._returns:
+            values |= {"return": f"{np.mean(self._returns):.1f}", "success": f"{np.mean(self._solved):.0%}"}
+        self._progress.show(report.env_steps, self._config.schedule.total_steps, values)
+
+    def _note_episodes(self, episodes: list[tuple[EpisodeSummary, int]] | tuple, env_steps: int) -> None:
+        if not episodes:
+            return
+        for episode, version in episodes:
+            self._run.log_episodes([episode], env_steps, version)
+            self._returns.append(episode.episode_return)
+            self._solved.append(episode.success_at_end)
+        summaries = [episode for episode, _ in episodes]
+        metrics = _episode_metrics(summaries, self._backend.reward_term_names, self._config.sac.reward_scale)
+        self._write("train" if episodes[0][1] >= 0 else "collect", env_steps, None, metrics)
+
+    def _write(self, phase: Phase, env_steps: int, updates: int | None, values: Mapping[str, float]) -> None:
+        axes = {"time_s": self._time_s(), "env_steps": env_steps, "phase": phase_index(phase)}
+        if updates is not None:
+            axes["updates"] = updates
+        self._sink.write(axes | dict(values))
+
+    def _time_s(self) -> float:
+        return time.monotonic() - self._began
+
+
+def _episode_metrics(
+    episodes: list[EpisodeSummary], term_names: tuple[str, ...], reward_scale: float
+) -> dict[str, float]:
+    mean_return = float(np.mean([e.episode_return for e in episodes]))
+    terms = np.mean([e.reward_terms for e in episodes], axis=0)
+    return {
+        "episode_return": mean_return,
+        "episode_return_scaled": mean_return * reward_scale,
+        "episode_length_steps": float(np.mean([e.length for e in episodes])),
+        "episode_success": float(np.mean([e.success_at_end for e in episodes])),
+        "episode_success_once": float(np.mean([e.success_once for e in episodes])),
+        "episode_placed": float(np.mean([e.placed_at_end for e in episodes])),
+        "episode_grasped": float(np.mean([e.grasped_once for e in episodes])),
+    } | {f"episode_reward_term/{name}": float(value) for name, value in zip(term_names, terms, strict=True)}
+
+
+def _pretrain_line(metrics: Mapping[str, float]) -> dict[str, str]:
+    line = {
+        "steps/s": f"{metrics.get('pretrain_steps_per_s', 0):.1f}",
+        "position": f"{metrics.get('pretrain_position_loss', 0):.4f}",
+        "visibility": f"{metrics.get('pretrain_visibility_loss', 0):.3f}",
+        "attention": f"{metrics.get('pretrain_attention_loss', 0):.3f}",
+    }
+    if "pretrain_position_error_px" in metrics:
+        line["error"] = f"{metrics['pretrain_position_error_px']:.1f} px"
+    return line

@@ -1,0 +1,177 @@
+"""A run's directory: its config, versions, logs and checkpoints, and the lock that keeps it to one driver."""
+
+import dataclasses
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import socket
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from slotfilm_dist import __version__
+from slotfilm_dist.atomic import write_atomic
+from slotfilm_dist.config import RunConfig, changed_fields, load_config, save_config
+from slotfilm_dist.messages import EpisodeSummary
+
+PACKAGES = ("ray", "torch", "torchvision", "mani_skill", "sapien", "gymnasium", "numpy", "msgpack", "safetensors")
+RUN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+RESUMABLE = ("schedule", "evaluation", "runtime", "checkpoint")
+"""Sections that may change when a run is resumed."""
+
+
+def new_run_directory(root: Path, config: RunConfig, preset: str, name: str = "") -> Path:
+    """A directory for a new run that does not exist yet.
+
+    Raises:
+        ValueError: the name has characters that a file name should not have, or such a run exists.
+    """
+    if name:
+        if not RUN_NAME.fullmatch(name):
+            raise ValueError(f"--name {name!r}: use letters, digits, '.', '_' and '-', at most 100 of them")
+        if (root / name).exists():
+            raise ValueError(f"{root / name} exists; choose another --name, or go on with --resume {root / name}")
+        return root / name
+    stem = f"{preset}-{config.variant}-s{config.seed}"
+    number = 1
+    while (root / f"{stem}-{number:03d}").exists():
+        number += 1
+    return root / f"{stem}-{number:03d}"
+
+
+class RunDirectory:
+    """One run on disk, held by one driver at a time.
+
+    Use it as a context manager: entering takes the lock, leaving gives it back; a driver that died has given it back.
+
+    Args:
+        path: the directory.
+        config: of the run.
+    """
+
+    def __init__(self, path: Path, config: RunConfig) -> None:
+        self.path = path
+        self.config = config
+        path.mkdir(parents=True, exist_ok=True)
+        self._lock = FileLock(path / ".lock")
+
+    @classmethod
+    def create(cls, path: Path, config: RunConfig) -> "RunDirectory":
+        """A new run; writes nothing before it is entered."""
+        return cls(path, config)
+
+    @classmethod
+    def resume(cls, path: Path, changes: RunConfig | None = None) -> "RunDirectory":
+        """An existing run, with changed budgets or places if wanted.
+
+        Raises:
+            ValueError: there is no run, or the changes touch what it has already learned from.
+        """
+        config = load_config(path / "config.json")
+        if changes is not None:
+            fixed = [name for name in changed_fields(config, changes) if name.split(".")[0] not in RESUMABLE]
+            if fixed:
+                raise ValueError(
+                    f"--resume {path}: {', '.join(fixed)} cannot change in a run that has begun; "
+                    f"only {', '.join(RESUMABLE)} can. Start a new run instead"
+                )
+            config = changes
+        return cls(path, config)
+
+    def __enter__(self) -> "RunDirectory":
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout:
+            owner = self._read("owner.json")
+            raise ValueError(
+                f"{self.path} is in use by process {owner.get('pid', '?')} on {owner.get('host', 'another machine')}; "
+                "stop it first, or start a new run"
+            ) from None
+        save_config(self.config, self.path / "config.json")
+        self._write("owner.json", {"pid": os.getpid(), "host": socket.gethostname(), "since": _now()})
+        if not (self.path / "versions.json").exists():
+            self._write("versions.json", describe_machine())
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._lock.release()
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the checkpoints."""
+        return self.path / "checkpoints"
+
+    @property
+    def metrics(self) -> Path:
+        """File of the metrics, one JSON object a line."""
+        return self.path / "metrics.jsonl"
+
+    def log_episodes(self, episodes: Iterable[EpisodeSummary], env_steps: int, policy_version: int) -> None:
+        """Append finished training episodes."""
+        with (self.path / "episodes.jsonl").open("a", encoding="utf-8") as file:
+            for episode in episodes:
+                record = dataclasses.asdict(episode) | {"env_steps": env_steps, "policy_version": policy_version}
+                file.write(json.dumps(record) + "\n")
+
+    def read_status(self) -> dict[str, Any]:
+        """How far the run has come: what `write_status` last wrote, empty before."""
+        return self._read("status.json")
+
+    def write_status(self, **values: Any) -> None:
+        """Note how far the run has come."""
+        self._write("status.json", values | {"written_at": _now()})
+
+    def _read(self, name: str) -> dict[str, Any]:
+        try:
+            values = json.loads((self.path / name).read_text(encoding="utf-8"))
+        except (FileNotFoundError, UnicodeDecodeError, json.JSONDecodeError):
+            return {}
+        return values if isinstance(values, dict) else {}
+
+    def _write(self, name: str, values: dict[str, Any]) -> None:
+        write_atomic(self.path / name, [json.dumps(values, indent=1).encode()])
+
+
+def describe_machine() -> dict[str, Any]:
+    """Versions, machine and command, for the record."""
+    versions: dict[str, Any] = {"slotfilm_dist": __version__}
+    for package in PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = "not installed"
+    return versions | {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cpu": f"{_cpu_model()}, {os.cpu_count()} cores",
+        "gpu": _gpu_model(),
+        "command": " ".join(["slotfilm", *sys.argv[1:]]),
+        "started_at": _now(),
+    }
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
+
+
+def _gpu_model() -> str:
+    import torch
+
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
+
+
+def _now() -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%S%z")
