@@ -3,7 +3,7 @@
 import importlib
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from slotfilm_dist import __version__
 
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
 
 
-def _command(name: str):  # noqa: ANN202  a function of the command's module
+def _command(name: str) -> Callable[[Sequence[str]], int]:
     if name not in COMMANDS:
         import difflib
 

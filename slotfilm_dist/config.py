@@ -62,7 +62,7 @@ class EnvConfig:
     assets: Literal["procedural", "ycb"] = "procedural"
     """Object meshes: generated here, or ManiSkill's downloaded YCB banana and bowl."""
     goal: Literal["near_bowl", "fixed", "random"] = "near_bowl"
-    """Where the target point is placed: beside and above the bowl, at one fixed point, or anywhere above the table."""
+    """Where the target point is: beside and above the bowl, at one fixed point, or anywhere above the table."""
     goal_visible: bool = False
     """Draw the green target in the wrist camera's picture (ManiSkill hides goal markers from sensors)."""
     control_mode: str = "pd_ee_delta_pose"
@@ -127,7 +127,7 @@ class ObsConfig:
             total == self.state_dim,
             "obs.state_dim",
             self.state_dim,
-            f"the fields {', '.join(self.state_fields)} add up to {total}; set obs.state_dim to {total} if that is meant",
+            f"the fields {', '.join(self.state_fields)} add up to {total}; set obs.state_dim = {total} if meant so",
         )
 
     def field_dim(self, name: str) -> int:
@@ -165,7 +165,7 @@ class RewardConfig:
     """The multiscale shaped reward (Section 4.5)."""
 
     alpha: float = 10.0
-    """Decay of the exponential distance terms in 1/m (Figure 13 varies it, or the reward scale; see `sac.reward_scale`)."""
+    """Decay of the exponential distance terms in 1/m (Figure 13 varies it, or `sac.reward_scale`)."""
     varpi: float = 5.0
     """Sharpness of the stability term in s/rad (Figure 11)."""
     delta_m: float = 0.025
@@ -218,7 +218,7 @@ class EncoderConfig:
     backbone: Literal["imagenet", "path", "random"] = "imagenet"
     """Initial ResNet-18 weights: torchvision's ImageNet download, a file, or random. Never falls back silently."""
     backbone_path: str = ""
-    """File of ResNet-18 weights (.safetensors, or a torch state dict loaded with weights_only) for `backbone = path`."""
+    """ResNet-18 weights for `backbone = path`: .safetensors, or a torch state dict (loaded with weights_only)."""
     feature_dim: int = 42
     """Channels D of tokens, slots and FiLM."""
     num_heads: int = 3
@@ -409,11 +409,14 @@ class ScheduleConfig:
     """Environment steps over all phases: 3000 epochs of 400."""
     random_steps: int = 100_000
     """Steps of the random policy before any learning; also the pre-training data."""
+    random_episode_steps: int = 0
+    """Length of the random policy's episodes; 0 is `env.max_steps`. Short ones show more scenes in few steps."""
     updates_per_step: float = 1.0
     """Optimiser updates per environment step once learning has begun."""
 
     def __post_init__(self) -> None:
         _positive("schedule", self, "total_steps", "random_steps", "updates_per_step")
+        _not_negative("schedule", self, "random_episode_steps")
         check(
             self.random_steps <= self.total_steps,
             "schedule.random_steps",
@@ -534,7 +537,8 @@ class RunConfig:
             self.encoder.num_slots >= self.obs.num_objects or not self.encoder.uses_image or self.pretrain.steps == 0,
             "encoder.num_slots",
             self.encoder.num_slots,
-            f"pre-training matches every object to a slot of its own and needs at least obs.num_objects = {self.obs.num_objects}",
+            "pre-training matches every object to a slot of its own and needs at least "
+            f"obs.num_objects = {self.obs.num_objects}",
         )
 
 

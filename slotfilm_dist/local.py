@@ -64,11 +64,19 @@ class LocalBackend:
         self._device = learner_device(config)
         # All cores at once would be slower: SAC's products are small, and threads that wait for each other spin.
         torch.set_num_threads(config.runtime.learner_threads or max(1, int(usable_cores()) // 2))
-        self._env = WristEnv(config, camera=config.encoder.uses_image)
-        self._own_env: WristEnv | None = None
-        self.action_dim = self._env.action_dim
-        self.reward_term_names = self._env.reward_term_names
+        self._training_env: WristEnv | None = None
+        self._playing_env: WristEnv | None = None
         self._learner: Learner | None = None
+
+    @property
+    def action_dim(self) -> int:
+        """Size of the action."""
+        return self._any_env.action_dim
+
+    @property
+    def reward_term_names(self) -> tuple[str, ...]:
+        """Names of the reward's components."""
+        return self._any_env.reward_term_names
 
     def random_blocks(self, num_steps: int, start: int) -> Iterator[TransitionBlock]:
         """Blocks of the random policy; a collection continued at step `start` has random streams of its own."""
@@ -77,11 +85,13 @@ class LocalBackend:
         loop = RolloutLoop(
             self._env, policy, role_seed(seed, Role.RANDOM_EPISODES, incarnation=start), incarnation=start
         )
+        self._env.episode_steps = self._config.schedule.random_episode_steps or self._config.env.max_steps
         done = 0
         while done < num_steps:
             block = loop.collect(min(self._config.runtime.block_steps, num_steps - done))
             done += block.num_steps
             yield block
+        self._env.episode_steps = self._config.env.max_steps
 
     def pretrain(self, dataset: Path, artifact: Path) -> Iterator[dict[str, float]]:
         """Pre-train and write the result, continuing what an interrupted pre-training left."""
@@ -215,9 +225,9 @@ class LocalBackend:
 
     def close(self) -> None:
         """Release the simulators."""
-        self._env.close()
-        if self._own_env is not None:
-            self._own_env.close()
+        for env in (self._training_env, self._playing_env):
+            if env is not None:
+                env.close()
 
     def _build_replay(self, learner: Learner) -> ShardedReplay:
         config, schema = self._config, learner.schema()
@@ -241,13 +251,24 @@ class LocalBackend:
         env = self._evaluation_env(camera)
         yield from play_episodes(env, self._player(player, env), seeds, watch)
 
+    @property
+    def _env(self) -> WristEnv:
+        """The environment that training collects in, built at the first need."""
+        if self._training_env is None:
+            self._training_env = WristEnv(self._config, camera=self._config.encoder.uses_image)
+        return self._training_env
+
+    @property
+    def _any_env(self) -> WristEnv:
+        return self._playing_env or self._env
+
     def _evaluation_env(self, camera: bool) -> WristEnv:
         """An environment of its own, so that training's is not disturbed; with a camera from its first need on."""
-        if self._own_env is None or (camera and not self._own_env.has_camera):
-            if self._own_env is not None:
-                self._own_env.close()
-            self._own_env = WristEnv(self._config, camera=camera)
-        return self._own_env
+        if self._playing_env is None or (camera and not self._playing_env.has_camera):
+            if self._playing_env is not None:
+                self._playing_env.close()
+            self._playing_env = WristEnv(self._config, camera=camera)
+        return self._playing_env
 
     def _player(self, player: Player, env: WristEnv) -> Policy:
         seed = role_seed(self._config.seed, Role.EVALUATION)

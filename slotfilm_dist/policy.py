@@ -1,7 +1,7 @@
 """Who chooses the actions: the trained agent or the uniform random policy."""
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from slotfilm_dist.nets.interface import Encoder
 from slotfilm_dist.nets.policy_heads import Actor
 
 
+@runtime_checkable
 class Policy(Protocol):
     """Chooses actions. The loop that uses it: visual = policy.visual(observation); policy.act(observation, visual)."""
 

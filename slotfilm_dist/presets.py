@@ -39,7 +39,7 @@ def laptop() -> RunConfig:
     return replace(
         base,
         encoder=replace(base.encoder, backbone="random"),
-        pretrain=replace(base.pretrain, steps=6_000, batch_size=32, lr=5e-4),
+        pretrain=replace(base.pretrain, steps=6_000, batch_size=64, lr=1e-3, train_backbone="none"),
         schedule=replace(base.schedule, total_steps=300_000, random_steps=20_000, updates_per_step=0.5),
         replay=replace(base.replay, capacity=300_000),
         evaluation=replace(base.evaluation, every_steps=50_000, during_episodes=5, episodes=50),
@@ -53,8 +53,8 @@ def quick() -> RunConfig:
     return replace(
         base,
         env=replace(base.env, max_steps=200),
-        pretrain=replace(base.pretrain, steps=800, batch_size=16, eval_every=100),
-        schedule=replace(base.schedule, total_steps=10_000, random_steps=3_000, updates_per_step=0.5),
+        pretrain=replace(base.pretrain, steps=1_500, eval_every=100),
+        schedule=replace(base.schedule, total_steps=10_000, random_steps=4_000, random_episode_steps=32),
         replay=replace(base.replay, capacity=20_000, min_steps=1_000),
         evaluation=replace(base.evaluation, episodes=6, every_steps=0, videos=1),
         checkpoint=replace(base.checkpoint, every_updates=1_000),

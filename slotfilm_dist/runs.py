@@ -18,7 +18,7 @@ from filelock import FileLock, Timeout
 
 from slotfilm_dist import __version__
 from slotfilm_dist.atomic import write_atomic
-from slotfilm_dist.config import RunConfig, changed_fields, load_config, save_config
+from slotfilm_dist.config import RunConfig, changed_fields, save_config
 from slotfilm_dist.messages import EpisodeSummary
 
 PACKAGES = ("ray", "torch", "torchvision", "mani_skill", "sapien", "gymnasium", "numpy", "msgpack", "safetensors")
@@ -46,6 +46,17 @@ def new_run_directory(root: Path, config: RunConfig, preset: str, name: str = ""
     return root / f"{stem}-{number:03d}"
 
 
+def resumed_config(path: Path, config: RunConfig, changed: RunConfig) -> RunConfig:
+    """The changed config of a run that goes on; raises ``ValueError`` if it touches what was already learned from."""
+    fixed = [name for name in changed_fields(config, changed) if name.split(".")[0] not in RESUMABLE]
+    if fixed:
+        raise ValueError(
+            f"--resume {path}: {', '.join(fixed)} cannot change in a run that has begun; "
+            f"only {', '.join(RESUMABLE)} can. Start a new run instead"
+        )
+    return changed
+
+
 class RunDirectory:
     """One run on disk, held by one driver at a time.
 
@@ -61,29 +72,6 @@ class RunDirectory:
         self.config = config
         path.mkdir(parents=True, exist_ok=True)
         self._lock = FileLock(path / ".lock")
-
-    @classmethod
-    def create(cls, path: Path, config: RunConfig) -> "RunDirectory":
-        """A new run; writes nothing before it is entered."""
-        return cls(path, config)
-
-    @classmethod
-    def resume(cls, path: Path, changes: RunConfig | None = None) -> "RunDirectory":
-        """An existing run, with changed budgets or places if wanted.
-
-        Raises:
-            ValueError: there is no run, or the changes touch what it has already learned from.
-        """
-        config = load_config(path / "config.json")
-        if changes is not None:
-            fixed = [name for name in changed_fields(config, changes) if name.split(".")[0] not in RESUMABLE]
-            if fixed:
-                raise ValueError(
-                    f"--resume {path}: {', '.join(fixed)} cannot change in a run that has begun; "
-                    f"only {', '.join(RESUMABLE)} can. Start a new run instead"
-                )
-            config = changes
-        return cls(path, config)
 
     def __enter__(self) -> "RunDirectory":
         try:

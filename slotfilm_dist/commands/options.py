@@ -2,7 +2,10 @@
 
 import argparse
 import contextlib
+import dataclasses
+import difflib
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NoReturn
@@ -50,10 +53,15 @@ def build_config(preset: str, variant: str, fields: Sequence[str], *, show_field
     if task:
         base = replace(base, env=replace(base.env, task=task))
     base = apply_variant(variant or base.variant, adapt_config(base))
-    return _parse_fields(base, ["--help"] if show_fields else list(fields))
+    return change_fields(base, ["--help"] if show_fields else fields)
 
 
-def _parse_fields(base: RunConfig, fields: list[str]) -> RunConfig:
+def change_fields(base: RunConfig, fields: Sequence[str]) -> RunConfig:
+    """The config with single fields changed, `--section.field value`.
+
+    Raises:
+        ValueError: an unknown field (with the nearest known one) or an impossible value.
+    """
     import tyro
 
     shown = io.StringIO()
@@ -66,10 +74,8 @@ def _parse_fields(base: RunConfig, fields: list[str]) -> RunConfig:
         raise ValueError(_refusal(fields, shown.getvalue())) from None
 
 
-def _refusal(fields: list[str], shown: str) -> str:
+def _refusal(fields: Sequence[str], shown: str) -> str:
     """One sentence of what tyro has to say in a box."""
-    import difflib
-
     known = _field_names(RunConfig(), "")
     for field in fields:
         name = field.removeprefix("--").split("=")[0].replace("-", "_")
@@ -77,12 +83,15 @@ def _refusal(fields: list[str], shown: str) -> str:
             near = difflib.get_close_matches(name, known, n=1)
             return f"unknown field --{name}" + (f"; did you mean --{near[0]}?" if near else "; --fields lists them all")
     lines = [line.strip(" |│╭╮╰╯─\n") for line in shown.splitlines()]
-    return " ".join(line for line in lines if line and "--help" not in line)
+    text = " ".join(line for line in lines if line and "--help" not in line)
+    match = re.search(r"Error parsing (\S+): (.*?)(?: Argument helptext:.*)?$", text)
+    if match is None:
+        return text
+    where, what = match.groups()
+    return f"{where}: {what}" if where.startswith("--") else what
 
 
 def _field_names(config: object, where: str) -> list[str]:
-    import dataclasses
-
     names: list[str] = []
     for field in dataclasses.fields(config):  # type: ignore[arg-type]  # a config section
         value = getattr(config, field.name)

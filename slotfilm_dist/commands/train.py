@@ -5,8 +5,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from slotfilm_dist.commands.options import Parser, add_config_options, build_config
-from slotfilm_dist.config import RunConfig
+from slotfilm_dist.commands.options import Parser, add_config_options, build_config, change_fields
+from slotfilm_dist.config import RunConfig, load_config
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -25,23 +25,22 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
     options, fields = parser.parse_known_args(arguments)
 
-    from slotfilm_dist.runs import RunDirectory, new_run_directory
+    from slotfilm_dist.runs import new_run_directory
 
     if options.resume:
-        run = _resumed(Path(options.resume), fields)
+        path = Path(options.resume)
+        config = _resumed_config(path, fields)
     else:
         config = build_config(options.preset, options.variant, fields, show_fields=options.fields)
-        run = RunDirectory.create(new_run_directory(Path(options.runs), config, options.preset, options.name), config)
-    return _execute(run.path, run.config, Path(options.artifacts), as_json=options.json)
+        path = new_run_directory(Path(options.runs), config, options.preset, options.name)
+    return _execute(path, config, Path(options.artifacts), as_json=options.json)
 
 
-def _resumed(path: Path, fields: Sequence[str]):  # noqa: ANN202  the type would import torch early
-    from slotfilm_dist.commands.options import _parse_fields
-    from slotfilm_dist.config import load_config
-    from slotfilm_dist.runs import RunDirectory
+def _resumed_config(path: Path, fields: Sequence[str]) -> RunConfig:
+    from slotfilm_dist.runs import resumed_config
 
-    changes = _parse_fields(load_config(path / "config.json"), list(fields)) if fields else None
-    return RunDirectory.resume(path, changes)
+    config = load_config(path / "config.json")
+    return resumed_config(path, config, change_fields(config, fields)) if fields else config
 
 
 def _execute(path: Path, config: RunConfig, artifacts: Path, *, as_json: bool) -> int:

@@ -1,6 +1,7 @@
 """The wrist camera (Table A4): captures pictures straight from SAPIEN, with the render profile applied."""
 
 import math
+import os
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,9 @@ from torch import Tensor
 
 from slotfilm_dist.config import EnvConfig
 from slotfilm_dist.envs.render_profile import apply_render_profile
+
+# Software rendering of one small picture is fastest in the caller's own thread; Mesa reads this when it starts.
+os.environ.setdefault("LP_NUM_THREADS", "0")
 
 CAMERA = "hand_camera"
 CAMERA_LINK = "camera_link"
@@ -35,7 +39,7 @@ class WristCamera:
         self._env = env
         self._sensor = env.scene.sensors[CAMERA]
         self.tan_half_fov = math.tan(math.radians(config.fov_deg) / 2)
-        apply_render_profile(env, config.render_profile)
+        self._culling = apply_render_profile(env, config.render_profile)
         self._direct = not env.gpu_sim_enabled
         if self._direct:
             self._scene: sapien.Scene = env.scene.sub_scenes[0]
@@ -71,6 +75,7 @@ class WristCamera:
             self._env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
             self._sensor.capture()
             return self._sensor.get_obs(rgb=True, depth=False, position=False, segmentation=False)["rgb"].cpu().numpy()
+        self._culling.update()
         self._scene.update_render()
         self._camera.take_picture()
         picture = self._camera.get_picture("Color")

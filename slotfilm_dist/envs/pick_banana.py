@@ -5,7 +5,7 @@ wrappers and vector environment, and is written batched, so that it also runs wi
 """
 
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import sapien
@@ -59,8 +59,8 @@ class PickBananaEnv(BaseEnv):
         mesh_cache: folder for the generated meshes.
     """
 
-    SUPPORTED_ROBOTS = ["panda_wristcam_direct", "panda_wristcam"]
-    SUPPORTED_REWARD_MODES = ["dense", "normalized_dense", "sparse", "none"]
+    SUPPORTED_ROBOTS: ClassVar[list[str]] = ["panda_wristcam_direct", "panda_wristcam"]
+    SUPPORTED_REWARD_MODES: ClassVar[list[str]] = ["dense", "normalized_dense", "sparse", "none"]
     agent: SlotfilmPanda
 
     def __init__(

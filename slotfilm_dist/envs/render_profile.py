@@ -1,9 +1,9 @@
 """Render profiles: what is left out of the wrist camera's pictures because that camera cannot see it.
 
-A software renderer works through every triangle of the scene, seen or not, and of a Panda with a wrist camera nearly all
-triangles belong to what never or seldom comes into view: 425,160 to the camera's own housing, 134,300 to arm and hand,
-20,000 to a floor of 100 m by 100 m. The profile `wrist` leaves out exactly what lies outside the camera's pyramid of
-view, so its pictures are those of `full`, pixel by pixel:
+A software renderer works through every triangle of the scene, seen or not, and nearly all triangles around a Panda with
+a wrist camera belong to what never or seldom comes into view: 425,160 to the camera's own housing, 134,300 to arm and
+hand, 20,000 to a floor of 100 m by 100 m. The profile `wrist` leaves out exactly what lies outside the camera's pyramid
+of view, so its pictures are those of `full`, pixel by pixel:
 
 - Links that move with the camera (housing, hand, last link) are looked at once, triangle by triangle.
 - The other links of the arm are looked at before each picture, by the eight corners of their bounding boxes.
@@ -12,17 +12,12 @@ view, so its pictures are those of `full`, pixel by pixel:
 Left out means disabled: what is merely invisible is still worked through.
 """
 
-import time
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import gymnasium as gym
 import numpy as np
 import sapien
-import torch
-from jaxtyping import Bool, Float, Int, Shaped
-
-import slotfilm_dist.envs.pick_banana  # noqa: F401  registers PickBanana-v1
+from jaxtyping import Bool, Float, UInt32
 
 RenderProfile = Literal["wrist", "full"]
 
@@ -60,8 +55,7 @@ class PictureCulling:
         self._floor_height_m = floor_height_m
         if camera is not None:
             self._view = _View.of(camera)
-            boxes = [_box_corners(_triangles(body)) for body in self._moving]
-            self._boxes = np.array(boxes).reshape(-1, 8, 3)
+            self._boxes = np.array([_box_corners(body) for body in self._moving]).reshape(-1, 8, 3)
 
     def update(self) -> None:
         """Fit the scene to the camera's present pose: call it before every picture, 0.05 ms."""
@@ -76,6 +70,16 @@ class PictureCulling:
                 _switch(body, not hidden)
         if self._floor_far is not None:
             _switch(self._floor_far, self._view.reaches(to_world, self._floor_height_m, FLOOR_NEAR_M))
+
+    @property
+    def num_moving_drawn(self) -> int:
+        """Links drawn now among those looked at before each picture."""
+        return sum(body.is_enabled for body in self._moving)
+
+    @property
+    def far_floor_drawn(self) -> bool:
+        """Whether the far part of the floor is drawn now."""
+        return self._floor_far is not None and self._floor_far.is_enabled
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -137,10 +141,10 @@ def apply_render_profile(base_env: Any, profile: RenderProfile) -> PictureCullin
     moving = []
     for index, camera in enumerate(base_env.scene.sensors[WRIST_CAMERA].camera._render_cameras):
         for name, body in _link_bodies(base_env, index).items():
-            if _triangles(body) is None:
+            if not all(isinstance(shape, sapien.render.RenderShapeTriangleMesh) for shape in body.render_shapes):
                 continue
             if name in carried:
-                _switch(body, _any_triangle_in_view(body, camera))
+                _switch(body, _in_view(body, camera))
             elif "finger" not in name:
                 moving.append(body)
     if base_env.gpu_sim_enabled:
@@ -181,29 +185,45 @@ def _links_carrying_camera(base_env: Any) -> set[str]:
     return {link.name for link in base_env.agent.robot.get_links() if root(link.name) == mount}
 
 
-def _triangles(body: Any) -> Float[np.ndarray, "triangles 3 3"] | None:
-    """Corners of a body's triangles in its entity's frame; None if it has shapes that are no triangle meshes."""
-    corners = []
+def _parts(body: Any) -> list[tuple[Any, Float[np.ndarray, "4 4"]]]:
+    """Meshes that a body is drawn with, and the transform of their vertices to the entity's frame."""
+    found = []
     for shape in body.render_shapes:
-        if not isinstance(shape, sapien.render.RenderShapeTriangleMesh):
-            return None
-        pose = shape.local_pose.to_transformation_matrix()
-        for part in shape.parts:
-            vertices = np.asarray(part.vertices) * shape.scale @ pose[:3, :3].T + pose[:3, 3]
-            corners.append(vertices[np.asarray(part.triangles)])
-    return np.concatenate(corners) if corners else None
+        scale = np.diag(np.append(np.asarray(shape.scale, dtype=np.float32), np.float32(1)))
+        found += [(part, shape.local_pose.to_transformation_matrix() @ scale) for part in shape.parts]
+    return found
 
 
-def _box_corners(triangles: Float[np.ndarray, "triangles 3 3"]) -> Float[np.ndarray, "8 3"]:
-    points = triangles.reshape(-1, 3)
-    return np.array(np.meshgrid(*zip(points.min(axis=0), points.max(axis=0), strict=True))).reshape(3, 8).T
+def _box_corners(body: Any) -> Float[np.ndarray, "8 3"]:
+    """Corners of a box around a body, in its entity's frame."""
+    corners = []
+    for part, matrix in _parts(body):
+        columns = np.ascontiguousarray(np.asarray(part.vertices).T)
+        corners.append(_moved(_corners_between(columns.min(axis=1), columns.max(axis=1)), matrix))
+    points = np.concatenate(corners)
+    return _corners_between(points.min(axis=0), points.max(axis=0))
 
 
-def _any_triangle_in_view(body: Any, camera: Any) -> bool:
+def _corners_between(low: Float[np.ndarray, " 3"], high: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "8 3"]:
+    return np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, 8).T
+
+
+def _moved(points: Float[np.ndarray, "*shape 3"], matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "*shape 3"]:
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def _in_view(body: Any, camera: Any) -> bool:
+    """Whether any triangle of a body may be seen; the box first, which settles it for the 425,160 of the housing."""
+    view = _View.of(camera)
     to_world = camera.get_global_pose().to_transformation_matrix()
     to_camera = _inverse(to_world) @ body.entity.pose.to_transformation_matrix()
-    triangles = _triangles(body) @ to_camera[:3, :3].T + to_camera[:3, 3]
-    return not _View.of(camera).misses(triangles).all()
+    if view.misses(_moved(_box_corners(body), to_camera)[None]).all():
+        return False
+    for part, matrix in _parts(body):
+        vertices = _moved(np.asarray(part.vertices), to_camera @ matrix)
+        if not view.misses(vertices[np.asarray(part.triangles)]).all():
+            return True
+    return False
 
 
 def _inverse(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
@@ -234,23 +254,23 @@ def _restore(base_env: Any) -> None:
 def _split_floor(base_env: Any) -> tuple[Any | None, float]:
     """Replace the floor by a near and a far part made of its own triangles; the far part and the floor's height."""
     floor = _floor_entity(base_env)
-    whole = None if floor is None else floor.find_component_by_type(Body)
-    triangles = None if whole is None else _triangles(whole)
-    if floor is None or whole is None or triangles is None or len(whole.render_shapes) != 1:
+    if floor is None:
         return None, 0.0
+    whole = floor.find_component_by_type(Body)
     (part,) = whole.render_shapes[0].parts
-    near = (np.abs(triangles[..., :2]) <= FLOOR_NEAR_M).all(axis=(1, 2))
+    vertices, triangles = np.asarray(part.vertices), np.asarray(part.triangles)
+    near = (np.abs(vertices[triangles, :2]) <= FLOOR_NEAR_M).all(axis=(1, 2))
     parts = []
     for chosen in (near, ~near):
         body = Body()
-        body.attach(_submesh(part, np.asarray(part.triangles)[chosen]))
+        body.attach(_submesh(part, triangles[chosen]))
         floor.add_component(body)
         parts.append(body)
     whole.disable()
-    return parts[1], float(triangles[..., 2].max())
+    return parts[1], float(vertices[:, 2].max())
 
 
-def _submesh(part: Any, triangles: Int[np.ndarray, "triangles 3"]) -> Any:
+def _submesh(part: Any, triangles: UInt32[np.ndarray, "triangles 3"]) -> Any:
     used, index = np.unique(triangles, return_inverse=True)
     arrays = (part.vertices, part.get_vertex_normal(), part.get_vertex_uv())
     vertices, normals, uvs = (np.asarray(array)[used] for array in arrays)

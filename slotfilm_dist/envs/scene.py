@@ -1,7 +1,7 @@
 """Reads what the task needs from the simulator, once a control step.
 
-On the CPU SAPIEN's own objects are read directly: ManiSkill's batched properties cost several milliseconds a step there.
-On a GPU the batched properties are the fast way, and the same tensors come out.
+On the CPU SAPIEN's own objects are read directly: there ManiSkill's batched properties cost several milliseconds a
+step. On a GPU the batched properties are the fast way, and the same tensors come out.
 """
 
 from dataclasses import dataclass
@@ -100,7 +100,7 @@ class SceneReader:
                 finger, sign = first, 1.0
             else:
                 continue
-            if finger == left or finger == right:
+            if finger in (left, right):
                 touched = True
                 impulses[finger] += sign * np.sum([point.impulse for point in contact.points], axis=0)
         if not touched:

@@ -14,7 +14,7 @@ class Task:
     env_id: str
     """ManiSkill's name of the environment."""
     objects: tuple[str, ...]
-    """Attributes of the environment that hold the tracked actors; the first is to be grasped. They supervise the slots."""
+    """Attributes that hold the tracked actors, which supervise the slots; the first is to be grasped."""
     goal: str
     """Attribute that holds the goal's actor; empty for none (its state fields then read zero)."""
     max_steps: int
@@ -22,7 +22,7 @@ class Task:
     robot: str = "panda_wristcam"
     """ManiSkill's name of the robot."""
     own_reward: bool = False
-    """The task takes the `reward` and `success` sections; others bring ManiSkill's normalised dense reward and success."""
+    """Takes the `reward` and `success` sections; other tasks bring ManiSkill's normalised dense reward and success."""
 
 
 TASKS: dict[str, Task] = {

@@ -64,6 +64,8 @@ class WristEnv:
         self._camera = WristCamera(self._env, config.env) if camera else None  # imported above, only where needed
         self._reader = SceneReader(self._env, self._task.objects, self._task.goal)
         self._elapsed = np.zeros(num_envs, np.int64)
+        self.episode_steps = config.env.max_steps
+        """Steps after which an episode is truncated."""
 
     @property
     def has_camera(self) -> bool:
@@ -93,7 +95,7 @@ class WristEnv:
         self._elapsed += 1
         success = _array(info["success"], bool)
         ended = _array(terminated, bool) if self._config.env.terminate_on_success else np.zeros(self.num_envs, bool)
-        truncated = (self._elapsed >= self._config.env.max_steps) & ~ended
+        truncated = (self._elapsed >= self.episode_steps) & ~ended
         final = self._observe()
         scene = self.scene()
         result = {

@@ -49,7 +49,12 @@ def pretrain_hash(config: RunConfig) -> str:
 
 def data_identity(config: RunConfig) -> dict[str, Any]:
     """What the random policy's pictures depend on beside `env`."""
-    return {"seed": config.seed, "random_steps": config.schedule.random_steps}
+    schedule = config.schedule
+    return {
+        "seed": config.seed,
+        "random_steps": schedule.random_steps,
+        "random_episode_steps": schedule.random_episode_steps,
+    }
 
 
 class Learner:

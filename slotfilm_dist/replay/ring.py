@@ -69,11 +69,8 @@ class RowRing:
 
     def insert(self, block: TransitionBlock) -> None:
         """Store a valid block over the oldest rows; of one larger than the ring only the newest steps."""
-        new_steps = np.flatnonzero(block.is_step)[-self.capacity_steps :]
         skipped = max(0, block.num_rows - self.num_rows)
-        if len(new_steps) == self.capacity_steps:
-            skipped = max(skipped, int(new_steps[0]))
-        new_steps = new_steps[new_steps >= skipped] + self._next_row - skipped
+        new_steps = np.flatnonzero(block.is_step[skipped:])[-self.capacity_steps :] + self._next_row
         num_rows = block.num_rows - skipped
         self._forget(oldest_row=self._next_row + num_rows - self.num_rows, num_new_steps=len(new_steps))
         start = self._next_row % self.num_rows

@@ -84,6 +84,7 @@ def test_blocks_give_back_every_row_and_fill_replay(write, picture_schema, rows)
     np.testing.assert_array_equal(np.concatenate([block.visual for block in blocks]), dataset.rgb)
     np.testing.assert_array_equal(np.concatenate([block.reward for block in blocks]), dataset.reward)
     assert all(block.num_rows <= max(rows, 11) for block in blocks)
+    assert len(blocks) == {1: 14, 5: 14, 11: 14, 12: 12, 30: 5, 10_000: 1}[rows]
     shard = ReplayShard(picture_schema, 1000, 0)
     assert all(shard.insert(block) for block in blocks)
     assert shard.num_steps() == 120
@@ -118,6 +119,28 @@ def test_interrupted_writer_is_continued_from_its_last_commit(tmp_path, picture_
     np.testing.assert_array_equal(dataset.rgb, np.concatenate([block.visual for block in expected]))
     assert dataset.num_steps == 100
     assert dataset.num_episodes == len(np.unique(dataset.episode))
+
+
+def test_rows_that_were_never_committed_are_cut_off(tmp_path, picture_schema, make_block):
+    with FrameDatasetWriter(tmp_path, picture_schema, "h", commit_rows=10) as writer:
+        writer.append(make_block(0, 20, schema=picture_schema))
+        writer.append(make_block(20, 8, sequence=1, schema=picture_schema))
+    with FrameDatasetWriter(tmp_path, picture_schema, "h") as writer:
+        writer.finish()
+    np.testing.assert_array_equal(open_dataset(tmp_path, "h").proprio[:, 0], np.arange(21))
+    assert (tmp_path / "truncated.npy").stat().st_size == 256 + 21
+
+
+def test_episode_that_ends_as_the_next_one_begins_stays_apart(tmp_path, picture_schema, make_block):
+    first = make_block(0, 10, ends=[9], schema=picture_schema)
+    second = make_block(10, 10, sequence=1, schema=picture_schema)
+    for name in ("visual", "proprio", "goal"):
+        getattr(second, name)[0] = getattr(first, name)[-1]
+    with FrameDatasetWriter(tmp_path, picture_schema, "h") as writer:
+        writer.append(first)
+        writer.append(second)
+        writer.finish()
+    assert open_dataset(tmp_path, "h").num_episodes == 2
 
 
 def test_writer_that_failed_while_finishing_is_continued(tmp_path, picture_schema, make_block):

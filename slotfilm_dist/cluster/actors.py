@@ -1,0 +1,178 @@
+"""Thin shells that put the plain roles into Ray actors. They add a process and nothing else.
+
+Imports of a role stand in its constructor, so that a shard's process never loads torch.
+"""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import ray
+
+from slotfilm_dist.cluster.messages import AgentSetup, BlockKey, BlockNotice, LearnerStatus, WorkerBeat
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.messages import EpisodeSummary, TransitionBlock, WeightSnapshot
+
+if TYPE_CHECKING:
+    from slotfilm_dist.backend import Player
+    from slotfilm_dist.cluster.worker import EnvFactory, Limits
+    from slotfilm_dist.replay.schema import ReplaySchema
+
+
+class HubActor:
+    """A `Hub` in a process; workers wait in a group of threads of their own and never keep the learner waiting."""
+
+    def __init__(self, config: RunConfig) -> None:
+        from slotfilm_dist.cluster.hub import Hub, build_limiter
+
+        schedule = config.schedule
+        limiter = build_limiter(
+            schedule.updates_per_step,
+            max(config.replay.min_steps, schedule.random_steps),
+            config.runtime.block_steps,
+        )
+        self._hub = Hub(limiter, schedule.total_steps, config.runtime.num_workers)
+
+    @ray.method(concurrency_group="workers")
+    def admit_steps(
+        self, notice: BlockNotice, stored: Sequence[BlockKey], held_version: int, timeout_s: float
+    ) -> Any:
+        return self._hub.admit_steps(notice, stored, held_version, timeout_s)
+
+    @ray.method(concurrency_group="learner")
+    def admit_updates(self, max_updates: int, timeout_s: float) -> Any:
+        return self._hub.admit_updates(max_updates, timeout_s)
+
+    @ray.method(concurrency_group="control")
+    def call(self, method: str, *arguments: Any) -> Any:
+        """Any other method of the hub; none of them waits."""
+        return getattr(self._hub, method)(*arguments)
+
+
+class ShardActor:
+    """A `ShardRole` in a process; started again by Ray when it dies, with its last snapshot."""
+
+    def __init__(
+        self, config: RunConfig, schema: "ReplaySchema", index: int, folder: Path, *, resume: bool
+    ) -> None:
+        from slotfilm_dist.cluster.shard_role import ShardRole, build_shard
+
+        self._role = ShardRole(build_shard(config, schema, index), folder)
+        restarted = ray.get_runtime_context().was_current_actor_reconstructed
+        if resume or restarted:
+            self._role.restore(strict=not restarted)
+
+    @ray.method(concurrency_group="insert")
+    def insert(self, block: TransitionBlock) -> bool:
+        return self._role.insert(block)
+
+    @ray.method(concurrency_group="draw")
+    def draw(self, sizes: Sequence[int]) -> Any:
+        return self._role.draw(sizes)
+
+    @ray.method(concurrency_group="control")
+    def call(self, method: str, *arguments: Any) -> Any:
+        """Any other method of the role that is quick."""
+        return getattr(self._role, method)(*arguments)
+
+    @ray.method(concurrency_group="snapshot")
+    def snapshot(self) -> int:
+        return self._role.snapshot()
+
+
+class WorkerActor:
+    """A `WorkerLoop` in a process."""
+
+    def __init__(self, config: RunConfig, worker_id: int, make_env: "EnvFactory", limits: "Limits") -> None:
+        _prepare_for_acting(config)
+        from slotfilm_dist.cluster.worker import WorkerLoop
+
+        self._loop = WorkerLoop(config, worker_id, make_env, limits)
+
+    def train(self, incarnation: int, hub: Any, store: Any, setup: AgentSetup) -> None:
+        self._loop.train(incarnation, hub, store, setup)
+
+    def collect_randomly(self, incarnation: int) -> None:
+        self._loop.collect_randomly(incarnation)
+
+    def describe(self, timeout_s: float) -> tuple[int, tuple[str, ...]] | None:
+        return self._loop.describe(timeout_s)
+
+    def take_random_blocks(self, timeout_s: float) -> list[TransitionBlock]:
+        return self._loop.take_random_blocks(timeout_s)
+
+    def stop(self, timeout_s: float) -> bool:
+        return self._loop.stop(timeout_s)
+
+    @ray.method(concurrency_group="control")
+    def beat(self) -> WorkerBeat:
+        return self._loop.beat()
+
+    @ray.method(concurrency_group="control")
+    def process_id(self) -> int:
+        return os.getpid()
+
+
+class LearnerActor:
+    """A `LearnerRole` in a process."""
+
+    def __init__(self, config: RunConfig, action_dim: int, num_threads: int, *, gpu: bool, hub: Any) -> None:
+        import torch
+
+        from slotfilm_dist.cluster.learner_role import LearnerRole
+
+        torch.set_num_threads(num_threads)
+        self._role = LearnerRole(config, action_dim, torch.device("cuda" if gpu else "cpu"), hub)
+
+    def call(self, method: str, *arguments: Any, **options: Any) -> Any:
+        """A method of the role that takes its time."""
+        return getattr(self._role, method)(*arguments, **options)
+
+    @ray.method(concurrency_group="control")
+    def status(self) -> LearnerStatus:
+        return self._role.status()
+
+    @ray.method(concurrency_group="control")
+    def process_id(self) -> int:
+        return os.getpid()
+
+
+class PlayerActor:
+    """Plays evaluation episodes in a process of its own, one at a time."""
+
+    def __init__(self, config: RunConfig, make_env: "EnvFactory") -> None:
+        _prepare_for_acting(config)
+        from slotfilm_dist.cluster.player import PlayerRole
+
+        self._role = PlayerRole(config, make_env)
+
+    def prepare(
+        self, player: "Player", camera: bool, setup: AgentSetup | None, snapshot: WeightSnapshot | None
+    ) -> None:
+        self._role.prepare(player, camera=camera, setup=setup, snapshot=snapshot)
+
+    def play(self, seed: int) -> EpisodeSummary:
+        return self._role.play(seed)
+
+    def record(self, seed: int, video: Path, film_strip: Path) -> EpisodeSummary:
+        return self._role.record(seed, video, film_strip)
+
+
+def _prepare_for_acting(config: RunConfig) -> None:
+    """One core for drawing and as many torch threads as asked for; more would fight over the cores."""
+    os.environ["LP_NUM_THREADS"] = "0"  # the software Vulkan driver draws in the calling thread
+    import torch
+
+    torch.set_num_threads(config.runtime.worker_threads)
+
+
+CONCURRENCY: dict[type, dict[str, int]] = {
+    HubActor: {"workers": 64, "learner": 2, "control": 4},
+    ShardActor: {"insert": 2, "draw": 2, "control": 2, "snapshot": 1},
+    WorkerActor: {"control": 1},
+    LearnerActor: {"control": 2},
+    PlayerActor: {},
+}
+"""Threads of each group of an actor's methods; the rest share one thread."""
+

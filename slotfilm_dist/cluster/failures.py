@@ -1,0 +1,39 @@
+"""What can go wrong with a role, told in one line. Free of Ray, so that a command can catch it."""
+
+
+class RunFailedError(RuntimeError):
+    """The run cannot go on; the message names the cause and the remedy."""
+
+
+class RoleLostError(Exception):
+    """The process of a role is gone.
+
+    Args:
+        name: of the role.
+        reason: a word of the metric catalogue's restart reasons.
+        cause: one line.
+    """
+
+    def __init__(self, name: str, reason: str, cause: str) -> None:
+        super().__init__(f"{name} is gone: {cause}")
+        self.name, self.reason, self.cause = name, reason, cause
+
+    def __reduce__(self):  # noqa: ANN204  a tuple as the pickle protocol wants it
+        return type(self), (self.name, self.reason, self.cause)
+
+
+class RoleSilentError(Exception):
+    """A role did not answer in time.
+
+    Args:
+        name: of the role.
+        waiting_for: what was asked.
+        timeout_s: how long was waited.
+    """
+
+    def __init__(self, name: str, waiting_for: str, timeout_s: float) -> None:
+        super().__init__(f"{name} did not answer within {timeout_s:g} s: {waiting_for}")
+        self.name, self.waiting_for, self.timeout_s = name, waiting_for, timeout_s
+
+    def __reduce__(self):  # noqa: ANN204  a tuple as the pickle protocol wants it
+        return type(self), (self.name, self.waiting_for, self.timeout_s)

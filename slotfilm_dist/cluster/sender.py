@@ -1,0 +1,151 @@
+"""Takes a worker's blocks to replay while the worker goes on stepping."""
+
+import queue
+import threading
+import time
+from collections.abc import Iterable
+from typing import Protocol
+
+from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
+from slotfilm_dist.cluster.messages import BlockKey, BlockNotice, StepGrant
+from slotfilm_dist.messages import TransitionBlock, WeightSnapshot
+
+ADMIT_S = 1.0
+"""Longest wait of one request to the limiter."""
+RETRY_S = 0.2
+"""Pause before a shard that did not take a block is asked again."""
+
+
+class HubLink(Protocol):
+    """What a worker asks of the hub."""
+
+    def admit_steps(
+        self, notice: BlockNotice, stored: Iterable[BlockKey], held_version: int, timeout_s: float
+    ) -> StepGrant:
+        """Wait until a block's steps fit."""
+        ...
+
+    def confirm(self, stored: Iterable[BlockKey]) -> None:
+        """Note that blocks are in replay."""
+        ...
+
+    def latest(self, newer_than: int) -> WeightSnapshot | None:
+        """The newest weights."""
+        ...
+
+
+class StoreLink(Protocol):
+    """What a worker asks of replay."""
+
+    def insert(self, block: TransitionBlock) -> bool:
+        """Store a block once."""
+        ...
+
+
+class BlockSender:
+    """Asks the limiter for each block, then stores it, in a thread of its own.
+
+    Consumes blocks, one waiting and one under way; produces stored blocks, and weights that came with an answer. Waits
+    for the limiter, then for the block's shard, which it asks again until it answers; the same block is stored once.
+    Ends when closed, when the run has all its steps, or when the hub is gone.
+
+    Args:
+        hub: admits.
+        store: takes the blocks.
+    """
+
+    def __init__(self, hub: HubLink, store: StoreLink) -> None:
+        self._hub, self._store = hub, store
+        self._queue: queue.Queue[TransitionBlock | None] = queue.Queue(1)
+        self._closing = threading.Event()
+        self._stored: list[BlockKey] = []
+        self._snapshot: WeightSnapshot | None = None
+        self._held_version = -1
+        self._waiting_for = "room for a block"
+        self._error: Exception | None = None
+        self.finished = False
+        self._thread = threading.Thread(target=self._run, name="block-sender", daemon=True)
+        self._thread.start()
+
+    def offer(self, block: TransitionBlock, timeout_s: float) -> bool:
+        """Take a block, or say False while two are under way.
+
+        Raises:
+            RoleLostError: the hub is gone.
+            ValueError: replay refused a block.
+        """
+        if self._error is not None:
+            raise self._error
+        try:
+            self._queue.put(block, timeout=timeout_s)
+        except queue.Full:
+            return False
+        return True
+
+    def newest(self, held_version: int) -> WeightSnapshot | None:
+        """Weights newer than those held; asks the hub only for the very first ones."""
+        self._held_version = held_version
+        if self._snapshot is None and held_version < 0:
+            self._snapshot = self._hub.latest(held_version)
+        snapshot = self._snapshot
+        if snapshot is None or snapshot.version <= held_version:
+            return None
+        self._held_version = snapshot.version
+        return snapshot
+
+    def waiting_for(self) -> str:
+        """What it waits for now."""
+        return self._waiting_for
+
+    def close(self) -> None:
+        """Finish the block that was admitted, drop the others, confirm, and end."""
+        self._closing.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            while not (self._closing.is_set() or self.finished):
+                try:
+                    block = self._queue.get(timeout=RETRY_S)
+                except queue.Empty:
+                    continue
+                if block is not None and self._admit(block):
+                    self._deliver(block)
+            self._hub.confirm(self._stored)
+        except Exception as error:  # raised again in the thread that offers blocks
+            self._error = error
+
+    def _admit(self, block: TransitionBlock) -> bool:
+        key = BlockKey(worker_id=block.worker_id, incarnation=block.incarnation, sequence=block.sequence)
+        notice = BlockNotice(
+            key=key, num_steps=block.num_steps, policy_version=block.policy_version, episodes=block.episodes
+        )
+        while not self._closing.is_set():
+            grant = self._hub.admit_steps(notice, self._stored, self._held_version, ADMIT_S)
+            self._stored = []
+            if grant.snapshot is not None:
+                self._snapshot = grant.snapshot
+            if grant.finished:
+                self.finished = True
+                return False
+            if grant.granted:
+                return True
+            self._waiting_for = f"the limiter: {grant.waiting_for}"
+        return False
+
+    def _deliver(self, block: TransitionBlock) -> None:
+        """Store an admitted block; a shard that is being restarted is asked until it answers, or the loop is closed."""
+        self._waiting_for = "replay to store a block"
+        while True:
+            try:
+                self._store.insert(block)
+                break
+            except (RoleLostError, RoleSilentError) as error:
+                self._waiting_for = str(error)
+                if self._closing.is_set():
+                    return
+                time.sleep(RETRY_S)
+        self._stored.append(
+            BlockKey(worker_id=block.worker_id, incarnation=block.incarnation, sequence=block.sequence)
+        )
+        self._waiting_for = "room for a block"

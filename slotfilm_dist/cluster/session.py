@@ -1,0 +1,163 @@
+"""Joins the Ray cluster that is there, or starts a private one on this machine."""
+
+import contextlib
+import json
+import logging
+import os
+import secrets
+import shutil
+import signal
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import ray
+
+from slotfilm_dist.atomic import write_atomic
+from slotfilm_dist.machine import usable_cores, usable_memory_bytes
+
+STORE_BYTES = 1 << 30
+"""Object store of a private cluster: only blocks, batches and weights under way live there."""
+CLUSTER_FILE = "cluster.json"
+"""In the run directory: how `slotfilm scale` finds the run."""
+
+
+class Session:
+    """A connection to Ray; closing it ends a private cluster and removes its files.
+
+    With `RAY_ADDRESS` set, as inside a Ray job, or where Ray is connected already, as inside a Tune trial, that cluster
+    is used and left running. Otherwise a private one is started: loopback only, without a dashboard or usage reports,
+    with a token of its own (unless `RAY_AUTH_MODE` says otherwise) in a folder that nobody else can read.
+
+    Args:
+        num_cpus: cores of a private cluster; 0 takes all that may be used.
+    """
+
+    def __init__(self, num_cpus: int = 0) -> None:
+        self.private = False
+        self._joined = False
+        self._folder: Path | None = None
+        self._environment: dict[str, str | None] = {}
+        if ray.is_initialized():
+            return
+        self._joined = True
+        with _signal_handlers_kept():
+            if os.environ.get("RAY_ADDRESS"):
+                ray.init(address=os.environ["RAY_ADDRESS"], log_to_driver=False, logging_level=logging.ERROR)
+            else:
+                self._start_private(num_cpus or max(1, int(usable_cores())))
+
+    @property
+    def address(self) -> str:
+        """Of the cluster's head."""
+        return ray.get_runtime_context().gcs_address
+
+    @property
+    def token_path(self) -> str:
+        """File of the private cluster's token; empty without one."""
+        return self._environment_now("RAY_AUTH_TOKEN_PATH") if self.private else ""
+
+    def nodes(self) -> list[Mapping[str, float]]:
+        """Resources of every live node."""
+        return [node["Resources"] for node in ray.nodes() if node["Alive"]]
+
+    def available_cpus(self) -> float:
+        """Cores that nobody has asked for."""
+        return float(ray.available_resources().get("CPU", 0.0))
+
+    def write_cluster_file(self, run: Path, namespace: str) -> int:
+        """Note in the run directory where the run lives; gives how often it has been started, this time included."""
+        starts = int(read_cluster_file(run).get("starts", 0)) + 1
+        values = {"address": self.address, "namespace": namespace, "token_path": self.token_path, "starts": starts}
+        write_atomic(run / CLUSTER_FILE, [json.dumps(values, indent=1).encode()])
+        return starts
+
+    def close(self) -> None:
+        """Leave the cluster, or end the private one."""
+        if not self._joined:
+            return
+        ray.shutdown()
+        self._joined = False
+        for name, value in self._environment.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _start_private(self, num_cpus: int) -> None:
+        self.private = True
+        # A short path: the sockets below it may have no more than 107 characters.
+        self._folder = Path(tempfile.mkdtemp(prefix="slotfilm-"))
+        self._set("RAY_USAGE_STATS_ENABLED", "0")
+        if not os.environ.get("RAY_AUTH_MODE"):
+            token = self._folder / "token"
+            token.touch(mode=0o600)
+            token.write_text(secrets.token_hex(32))
+            self._set("RAY_AUTH_TOKEN_PATH", str(token))
+            self._set("RAY_AUTH_MODE", "token")
+        ray.init(
+            num_cpus=num_cpus,
+            object_store_memory=min(STORE_BYTES, usable_memory_bytes() // 4),
+            include_dashboard=False,
+            log_to_driver=False,
+            logging_level=logging.ERROR,
+            _temp_dir=str(self._folder),
+            _node_ip_address="127.0.0.1",
+        )
+
+    def _set(self, name: str, value: str) -> None:
+        self._environment.setdefault(name, os.environ.get(name))
+        os.environ[name] = value
+
+    @staticmethod
+    def _environment_now(name: str) -> str:
+        return os.environ.get(name, "")
+
+
+def read_cluster_file(run: Path) -> dict[str, Any]:
+    """What `write_cluster_file` wrote; empty if there is nothing."""
+    try:
+        values = json.loads((run / CLUSTER_FILE).read_text(encoding="utf-8"))
+    except (FileNotFoundError, UnicodeDecodeError, json.JSONDecodeError):
+        return {}
+    return values if isinstance(values, dict) else {}
+
+
+@contextlib.contextmanager
+def joined(run: Path) -> Iterator[str]:
+    """Connect to the cluster of a live run while the body runs; gives the run's namespace.
+
+    Raises:
+        ValueError: the run has never been on a cluster, or its cluster is gone.
+    """
+    values = read_cluster_file(run)
+    if not values:
+        raise ValueError(f"{run} has no {CLUSTER_FILE}: the run does not use Ray, or has not started yet")
+    if values["token_path"]:
+        os.environ["RAY_AUTH_MODE"], os.environ["RAY_AUTH_TOKEN_PATH"] = "token", values["token_path"]
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    try:
+        ray.init(address=values["address"], log_to_driver=False, logging_level=logging.ERROR)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"{run}: its cluster at {values['address']} does not answer ({reason}); is it running?") from None
+    try:
+        yield values["namespace"]
+    finally:
+        ray.shutdown()
+
+
+@contextlib.contextmanager
+def _signal_handlers_kept() -> Iterator[None]:
+    """Ray takes SIGTERM for itself when it starts; the run's own way to stop stays."""
+    try:
+        before = signal.getsignal(signal.SIGTERM)
+    except ValueError:
+        before = None
+    yield
+    with contextlib.suppress(ValueError):  # not the main thread: Ray has not taken it either
+        if before is not None:
+            signal.signal(signal.SIGTERM, before)

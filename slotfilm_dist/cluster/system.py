@@ -1,0 +1,263 @@
+"""Keeps the roles of a run alive. All loops of a run on a cluster, and who waits for whom:
+
+    WORKER x N (process each)                       HUB (process)                LEARNER (process)
+    loop: step env, act  ---block--> sender         counts steps, updates        updater: update, update, ...
+          ^ one block ready, one under way |        keeps newest weights           |  ^ chunk of batches
+          |                                |--may I insert?--> limiter <--may I update?-- fetcher
+          '------- newer weights ----------'   (answer brings weights)  <--weights--'  | draws
+                                           |                                           v
+                                           '--------------block--------------> SHARD x M (process each)
+    DRIVER (this process)
+    pipeline: reports once a second, checkpoints, evaluates (PLAYERS, processes of their own)
+    caretaker thread: `Supervisor.tick` and `ShardWatch.tick` four times a second
+
+| loop      | consumes        | produces         | waits for                    | unblocked by          | stops          |
+|-----------|-----------------|------------------|------------------------------|-----------------------|----------------|
+| worker    | weights         | blocks           | room in its sender           | a stored block        | between steps  |
+| sender    | blocks          | stored blocks    | limiter; a shard's answer    | updates; shard restart| after a block  |
+| fetcher   | grants, replay  | chunks           | limiter; replay's least size | steps; inserts        | within 0.5 s   |
+| updater   | chunks          | updates, weights | a chunk                      | fetcher               | after an update|
+| caretaker | beats           | restarts         | nothing                      | -                     | within 0.25 s  |
+
+Every wait has a timeout, is repeated in slices, and its reason is part of the role's beat. A worker that made no
+progress within the limit that its own beat names, or whose process is gone, is killed and replaced: next incarnation,
+new seeds. What it had been granted and not stored is taken back from the count of steps.
+"""
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from slotfilm_dist.cluster.failures import RoleLostError, RunFailedError
+from slotfilm_dist.cluster.messages import ShardBeat, WorkerBeat
+
+MAX_FAILURES = 5
+"""Failures of one worker in a row, without a block in between, before the run is given up."""
+FAILURE_WINDOW_S = 600.0
+"""Failures longer ago do not count."""
+START_LIMIT_S = 120.0
+"""Longest time until a new process answers; building its simulator has a limit of its own."""
+STOP_S = 5.0
+"""Time that a worker gets to finish its step and its block under way before it is killed."""
+
+
+class WorkerHandle(Protocol):
+    """A worker's process as the supervisor needs it."""
+
+    worker_id: int
+    silent_s: float
+
+    def poll(self) -> WorkerBeat | None:
+        """Its last beat; never waits; raises `RoleLostError` if the process is gone."""
+        ...
+
+    def begin_stop(self, timeout_s: float) -> object:
+        """Ask it to stop."""
+        ...
+
+    def stopped(self, request: object, timeout_s: float) -> bool:
+        """Whether it has stopped in time."""
+        ...
+
+    def kill(self) -> None:
+        """End the process at once."""
+        ...
+
+
+@dataclass(kw_only=True, slots=True)
+class _Member:
+    """A worker that should be running."""
+
+    handle: WorkerHandle
+    incarnation: int
+    employed_at: float
+    failures: list[float] = field(default_factory=list)
+    beat: WorkerBeat | None = None
+
+
+class Supervisor:
+    """Starts, watches, replaces and stops workers. Owns no data; waits for nothing but the end of workers it stops.
+
+    Args:
+        launch: starts the process of a worker.
+        employ: sets a worker to work with an incarnation.
+        settle: takes back what a lost worker (id, incarnation) was granted and did not store.
+        first_incarnation: of this start of the run; higher than any before.
+        clock: seconds that only grow.
+    """
+
+    def __init__(
+        self,
+        launch: Callable[[int], WorkerHandle],
+        employ: Callable[[WorkerHandle, int], None],
+        settle: Callable[[int, int], None],
+        first_incarnation: int = 0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._launch, self._employ, self._settle, self._clock = launch, employ, settle, clock
+        self._next_incarnation = first_incarnation
+        self._members: dict[int, _Member] = {}
+        self._lock = threading.RLock()
+        self.restarts: Counter[str] = Counter()
+        self.last_restart = ""
+
+    @property
+    def num_alive(self) -> int:
+        """Workers whose loop runs."""
+        with self._lock:
+            members = self._members.values()
+            return sum(m.beat is not None and m.beat.running and m.beat.incarnation == m.incarnation for m in members)
+
+    @property
+    def handles(self) -> list[WorkerHandle]:
+        """The workers that should be running."""
+        with self._lock:
+            return [member.handle for member in self._members.values()]
+
+    def beats(self) -> list[WorkerBeat]:
+        """The last beat of every worker that has given one."""
+        with self._lock:
+            return [member.beat for member in self._members.values() if member.beat is not None]
+
+    def scale(self, num_workers: int) -> None:
+        """Start or stop workers until so many should run."""
+        with self._lock:
+            for worker_id in range(num_workers):
+                if worker_id not in self._members:
+                    self._start(worker_id, [])
+            self._dismiss([worker_id for worker_id in self._members if worker_id >= num_workers])
+
+    def employ_again(self) -> None:
+        """Stop all loops and set the workers to work anew, as `employ` now means it; their environments stay."""
+        with self._lock:
+            members = list(self._members.values())
+            requests = [member.handle.begin_stop(STOP_S) for member in members]
+            for member, request in zip(members, requests, strict=True):
+                if member.handle.stopped(request, STOP_S):
+                    self._settle(member.handle.worker_id, member.incarnation)
+                    self._set_to_work(member)
+                else:
+                    self._replace(member, "hang", "its loop did not end")
+
+    def tick(self) -> None:
+        """Look at every worker once; replace those that are lost, hung or failed.
+
+        Raises:
+            RunFailedError: a worker failed too often.
+        """
+        with self._lock:
+            for member in list(self._members.values()):
+                fault = self._fault(member)
+                if fault is not None:
+                    self._replace(member, *fault)
+
+    def stop(self) -> None:
+        """Stop all workers: those that do not end in time are killed."""
+        with self._lock:
+            self._dismiss(list(self._members))
+
+    def _fault(self, member: _Member) -> tuple[str, str] | None:
+        """Reason and cause, if something is wrong."""
+        handle = member.handle
+        try:
+            beat = handle.poll()
+        except RoleLostError as error:
+            return error.reason, error.cause
+        if beat is None or beat.incarnation != member.incarnation:
+            late = self._clock() - member.employed_at > START_LIMIT_S
+            return ("hang", f"no answer within {START_LIMIT_S:g} s of its start") if late else None
+        member.beat = beat
+        if beat.error:
+            return beat.error_reason or "crash", beat.error
+        if beat.num_blocks:
+            member.failures.clear()
+        if handle.silent_s > beat.limit_s:
+            return "hang", f"no answer for {handle.silent_s:.0f} s while {beat.activity}"
+        if beat.running and beat.idle_s > beat.limit_s:
+            return "hang", f"no progress for {beat.idle_s:.0f} s while {beat.activity}"
+        return None
+
+    def _replace(self, member: _Member, reason: str, cause: str) -> None:
+        worker_id, now = member.handle.worker_id, self._clock()
+        member.handle.kill()
+        self._settle(worker_id, member.incarnation)
+        self.restarts[reason] += 1
+        self.last_restart = f"worker {worker_id} ({reason}): {cause}"
+        failures = [at for at in member.failures if now - at <= FAILURE_WINDOW_S] + [now]
+        if len(failures) >= MAX_FAILURES:
+            raise RunFailedError(
+                f"worker {worker_id} failed {len(failures)} times within {now - failures[0]:.0f} s without collecting a "
+                f"block, last: {cause}; `slotfilm doctor` checks what a worker needs, then go on with --resume"
+            )
+        self._start(worker_id, failures)
+
+    def _start(self, worker_id: int, failures: Sequence[float]) -> None:
+        handle = self._launch(worker_id)
+        member = _Member(handle=handle, incarnation=0, employed_at=0.0, failures=list(failures))
+        self._members[worker_id] = member
+        self._set_to_work(member)
+
+    def _set_to_work(self, member: _Member) -> None:
+        member.incarnation, member.employed_at, member.beat = self._next_incarnation, self._clock(), None
+        self._next_incarnation += 1
+        self._employ(member.handle, member.incarnation)
+
+    def _dismiss(self, worker_ids: Sequence[int]) -> None:
+        leaving = [self._members.pop(worker_id) for worker_id in worker_ids]
+        requests = [member.handle.begin_stop(STOP_S) for member in leaving]
+        for member, request in zip(leaving, requests, strict=True):
+            member.handle.stopped(request, STOP_S)
+            member.handle.kill()
+            self._settle(member.handle.worker_id, member.incarnation)
+
+
+class ShardHandle(Protocol):
+    """A shard as its watch needs it."""
+
+    index: int
+
+    def poll(self) -> ShardBeat | None:
+        """Its last beat; never waits; None while it does not answer."""
+        ...
+
+
+class ShardWatch:
+    """Counts the shards' restarts and notices when too little is left to learn from.
+
+    Args:
+        shards: Ray replaces their processes by itself.
+        min_steps: least number of stored steps to learn from.
+        start_over: called with the number of missing steps when fewer are left.
+    """
+
+    def __init__(self, shards: Sequence[ShardHandle], min_steps: int, start_over: Callable[[int], None]) -> None:
+        self._shards, self._min_steps, self._start_over = shards, min_steps, start_over
+        self._starts: dict[int, str] = {}
+        self._enough = False
+        self.beats: dict[int, ShardBeat] = {}
+        self.num_restarts = 0
+
+    @property
+    def num_steps(self) -> int:
+        """Steps stored in the shards that answer."""
+        return sum(beat.stats.num_steps for beat in self.beats.values())
+
+    def tick(self) -> None:
+        """Look at every shard once."""
+        for shard in self._shards:
+            beat = shard.poll()
+            if beat is None:
+                self.beats.pop(shard.index, None)
+                continue
+            self.num_restarts += self._starts.get(shard.index, beat.starts) != beat.starts
+            self._starts[shard.index] = beat.starts
+            self.beats[shard.index] = beat
+        self._enough |= self.num_steps >= self._min_steps
+        all_answer = len(self.beats) == len(self._shards)
+        if self._enough and all_answer and self.num_steps < self._min_steps:
+            # The learner waits for the steps that are missing now, so the workers must not wait for the learner.
+            self._enough = False
+            self._start_over(self._min_steps - self.num_steps)

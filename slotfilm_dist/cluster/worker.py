@@ -1,0 +1,326 @@
+"""An environment worker: steps its environment with the newest policy and gets rid of blocks. Plain, without Ray."""
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from slotfilm_dist.cluster.messages import AgentSetup, WorkerBeat
+from slotfilm_dist.cluster.sender import BlockSender, HubLink, StoreLink
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.contracts import VectorEnv
+from slotfilm_dist.messages import Observation, StepResult, TransitionBlock, WeightSnapshot
+from slotfilm_dist.nets.encoder import SlotFusionEncoder
+from slotfilm_dist.nets.policy_heads import Actor
+from slotfilm_dist.policy import AgentPolicy, Policy, RandomPolicy
+from slotfilm_dist.rollout import RolloutLoop
+from slotfilm_dist.seeds import Role, role_number, role_seed
+
+EnvFactory = Callable[[RunConfig, bool], VectorEnv]
+"""Builds the environment of a run, with a camera or without; a function at the top of a module."""
+
+BUILD_LIMIT_S = 180.0
+"""Longest time to build a simulator and its first episode."""
+STEP_LIMIT_S = 30.0
+"""Longest time of one environment step, and between two signs of life while waiting."""
+SLICE_S = 0.25
+"""Waits are cut in slices of this length, so that a stop is noticed."""
+
+
+class Stopped(Exception):
+    """The loop was asked to stop in the middle of a block."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Limits:
+    """How long a worker may go without progress."""
+
+    build_s: float = BUILD_LIMIT_S
+    step_s: float = STEP_LIMIT_S
+
+
+class Outlet(Protocol):
+    """Where a worker's blocks go."""
+
+    finished: bool
+    """No more blocks are wanted."""
+
+    def offer(self, block: TransitionBlock, timeout_s: float) -> bool:
+        """Take a block, or say False while there is no room."""
+        ...
+
+    def newest(self, held_version: int) -> WeightSnapshot | None:
+        """Weights newer than those that the worker holds, if any have come."""
+        ...
+
+    def waiting_for(self) -> str:
+        """What it waits for now."""
+        ...
+
+    def close(self) -> None:
+        """Get rid of what was taken, and end."""
+        ...
+
+
+class Mailbox:
+    """Keeps the random policy's blocks until they are fetched."""
+
+    def __init__(self, num_blocks: int) -> None:
+        self._queue: queue.Queue[TransitionBlock] = queue.Queue(num_blocks)
+        self.finished = False
+
+    def offer(self, block: TransitionBlock, timeout_s: float) -> bool:
+        """Take a block, or say False while it is full."""
+        try:
+            self._queue.put(block, timeout=timeout_s)
+        except queue.Full:
+            return False
+        return True
+
+    def take(self, timeout_s: float) -> list[TransitionBlock]:
+        """All blocks that are there, at least one unless time runs out."""
+        blocks: list[TransitionBlock] = []
+        try:
+            blocks.append(self._queue.get(timeout=timeout_s))
+            while True:
+                blocks.append(self._queue.get_nowait())
+        except queue.Empty:
+            return blocks
+
+    def newest(self, held_version: int) -> WeightSnapshot | None:
+        """The random policy has no weights."""
+        return None
+
+    def waiting_for(self) -> str:
+        """The driver fetches the blocks."""
+        return "the driver to fetch the random policy's blocks"
+
+    def close(self) -> None:
+        """What was not fetched is dropped."""
+        self.finished = True
+
+
+def build_policy(
+    config: RunConfig, setup: AgentSetup, seed: np.random.SeedSequence, *, deterministic: bool = False
+) -> AgentPolicy:
+    """The agent's policy on a CPU, with the learner's own encoder; `load` gives it the newest weights."""
+    encoder = SlotFusionEncoder(
+        config.encoder,
+        config.obs,
+        config.env.image_size,
+        seed=role_number(config.seed, Role.ENCODER),
+        fetch_weights=False,
+    )
+    encoder.load_state_dict({name: torch.tensor(value) for name, value in setup.encoder.items()})
+    if not config.sac.end_to_end:
+        encoder.freeze_backbone()
+    encoder.eval()
+    actor = Actor(
+        encoder.latent_dim,
+        setup.action_dim,
+        config.sac.hidden,
+        log_std_range=(config.sac.log_std_min, config.sac.log_std_max),
+    )
+    return AgentPolicy(encoder, actor, seed, deterministic=deterministic)
+
+
+class WorkerLoop:
+    """Steps one environment in a thread of its own.
+
+    Consumes weights; produces blocks of `runtime.block_steps` steps. Waits for its outlet to take a block: the limiter
+    and a shard in training, the driver while the random policy collects. Stops between two environment steps when told
+    to (`stop`), when its outlet is finished, or on an error, which `beat` then names.
+
+    Args:
+        config: the run.
+        worker_id: number of this worker.
+        make_env: builds the environment, in the loop's own thread.
+        limits: how long it may go without progress.
+    """
+
+    def __init__(self, config: RunConfig, worker_id: int, make_env: EnvFactory, limits: Limits | None = None) -> None:
+        self._config = config
+        self._worker_id = worker_id
+        self._make_env = make_env
+        self._limits = limits or Limits()
+        self._env: VectorEnv | None = None
+        self._built = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._stopping = threading.Event()
+        self._mailbox: Mailbox | None = None
+        self._sender: BlockSender | None = None
+        self._incarnation = 0
+        self._activity, self._limit_s, self._pulse_at = "nothing", self._limits.step_s, time.monotonic()
+        self._num_steps = self._num_blocks = 0
+        self._version = -1
+        self._waited_s = self._step_s = 0.0
+        self._error = self._error_reason = ""
+
+    def collect_randomly(self, incarnation: int) -> None:
+        """Start collecting with the random policy; `take_random_blocks` fetches the blocks."""
+        mailbox = self._mailbox = Mailbox(2)
+
+        def policy(action_dim: int) -> Policy:
+            return RandomPolicy(action_dim, self._seed(Role.RANDOM_ACTIONS, incarnation))
+
+        self._start(incarnation, mailbox, policy, Role.RANDOM_EPISODES)
+
+    def take_random_blocks(self, timeout_s: float) -> list[TransitionBlock]:
+        """Blocks of the random policy, at least one unless time runs out."""
+        assert self._mailbox is not None, "collect_randomly comes first"
+        return self._mailbox.take(timeout_s)
+
+    def train(self, incarnation: int, hub: HubLink, store: StoreLink, setup: AgentSetup) -> None:
+        """Start collecting with the trained agent for replay."""
+        sender = self._sender = BlockSender(hub, store)
+
+        def policy(action_dim: int) -> Policy:
+            return build_policy(self._config, setup, self._seed(Role.ACTIONS, incarnation))
+
+        self._start(incarnation, sender, policy, Role.EPISODES)
+
+    def describe(self, timeout_s: float) -> tuple[int, tuple[str, ...]] | None:
+        """Size of an action and names of the reward's terms, or None while the environment is being built."""
+        if not self._built.wait(timeout_s) or self._env is None:
+            return None
+        return self._env.action_dim, self._env.reward_term_names
+
+    def stop(self, timeout_s: float) -> bool:
+        """Stop the loop after the running step; False if it still runs when time is up."""
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join(timeout_s)
+            return not self._thread.is_alive()
+        return True
+
+    def beat(self) -> WorkerBeat:
+        """How it does."""
+        activity = self._activity
+        return WorkerBeat(
+            worker_id=self._worker_id,
+            incarnation=self._incarnation,
+            activity=activity,
+            limit_s=self._limit_s,
+            idle_s=time.monotonic() - self._pulse_at,
+            num_steps=self._num_steps,
+            num_blocks=self._num_blocks,
+            policy_version=self._version,
+            waited_s=self._waited_s,
+            step_s=self._step_s,
+            error=self._error,
+            error_reason=self._error_reason,
+            running=self._thread is not None and self._thread.is_alive(),
+        )
+
+    def _seed(self, role: Role, incarnation: int) -> np.random.SeedSequence:
+        return role_seed(self._config.seed, role, self._worker_id, incarnation)
+
+    def _start(self, incarnation: int, outlet: Outlet, make_policy: Callable[[int], Policy], episodes: Role) -> None:
+        assert self._thread is None or not self._thread.is_alive(), "stop comes first"
+        self._stopping = threading.Event()
+        self._incarnation = incarnation
+        self._num_steps = self._num_blocks = 0
+        self._error = self._error_reason = ""
+        self._note("starting", self._limits.build_s)
+        self._thread = threading.Thread(
+            target=self._run,
+            args=(outlet, make_policy, self._seed(episodes, incarnation)),
+            name=f"worker-{self._worker_id}",
+            daemon=True,
+        )
+        self._thread.start()
+
+    def _run(self, outlet: Outlet, make_policy: Callable[[int], Policy], seed: np.random.SeedSequence) -> None:
+        try:
+            rollout, policy = self._build(make_policy, seed)
+            while not (self._stopping.is_set() or outlet.finished):
+                self._follow(outlet, policy)
+                began = time.monotonic()
+                block = rollout.collect(self._config.runtime.block_steps)
+                self._step_s = (time.monotonic() - began) / max(1, block.num_steps)
+                _require_finite(block)
+                self._hand_over(outlet, block)
+        except Stopped:
+            pass
+        except Exception as error:  # told to the supervisor, which replaces this worker and counts it
+            self._error = f"{type(error).__name__}: {error}".splitlines()[0]
+            self._error_reason = "nonfinite" if isinstance(error, FloatingPointError) else "crash"
+        finally:
+            self._note("ending", self._limits.step_s)
+            outlet.close()
+
+    def _build(self, make_policy: Callable[[int], Policy], seed: np.random.SeedSequence) -> tuple[RolloutLoop, Policy]:
+        if self._env is None:
+            self._note("building the simulator", self._limits.build_s)
+            self._env = self._make_env(self._config, self._config.encoder.uses_image)
+            self._built.set()
+        policy = make_policy(self._env.action_dim)
+        self._note("starting the first episode", self._limits.build_s)
+        watched = _WatchedEnv(self._env, self._note_step)
+        return RolloutLoop(watched, policy, seed, self._worker_id, self._incarnation), policy
+
+    def _follow(self, outlet: Outlet, policy: Policy) -> None:
+        """Take over newer weights where there are any; the trained agent does not act without."""
+        if isinstance(policy, AgentPolicy):
+            snapshot = outlet.newest(self._version)
+            while snapshot is None and self._version < 0:
+                self._note("waiting for the first weights", self._limits.step_s)
+                if self._stopping.wait(SLICE_S):
+                    raise Stopped
+                snapshot = outlet.newest(self._version)
+            if snapshot is not None:
+                policy.load(snapshot.version, snapshot.arrays)
+                self._version = snapshot.version
+
+    def _hand_over(self, outlet: Outlet, block: TransitionBlock) -> None:
+        began = time.monotonic()
+        while not outlet.finished:
+            self._note(f"waiting for {outlet.waiting_for()}", self._limits.step_s)
+            if outlet.offer(block, SLICE_S):
+                self._num_steps += block.num_steps
+                self._num_blocks += 1
+                break
+            if self._stopping.is_set():
+                raise Stopped
+        self._waited_s += time.monotonic() - began
+
+    def _note(self, activity: str, limit_s: float) -> None:
+        self._activity, self._limit_s, self._pulse_at = activity, limit_s, time.monotonic()
+
+    def _note_step(self) -> None:
+        self._note("stepping the environment", self._limits.step_s)
+        if self._stopping.is_set():
+            raise Stopped
+
+
+class _WatchedEnv:
+    """An environment that says when it begins a step."""
+
+    def __init__(self, env: VectorEnv, note_step: Callable[[], None]) -> None:
+        self._env = env
+        self._note_step = note_step
+        self.num_envs = env.num_envs
+        self.action_dim = env.action_dim
+        self.reward_term_names = env.reward_term_names
+
+    def reset(self, seeds: Sequence[int]) -> Observation:
+        return self._env.reset(seeds)
+
+    def step(self, action: Float32[np.ndarray, "envs action"], next_seeds: Sequence[int]) -> StepResult:
+        self._note_step()
+        return self._env.step(action, next_seeds)
+
+    def close(self) -> None:
+        self._env.close()
+
+
+def _require_finite(block: TransitionBlock) -> None:
+    for name in ("reward", "proprio", "goal", "action"):
+        if not np.isfinite(getattr(block, name)).all():
+            raise FloatingPointError(f"{name} of the environment is not finite in block {block.sequence}")
