@@ -1,14 +1,13 @@
 # Every target works from a fresh clone: those that need the virtual environment make it first.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check bench doctor clean distclean
+.PHONY: help setup demo test test-all check doctor clean distclean
 
 PYTEST_ARGS ?=
-BENCH_ARGS ?=
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
-	@echo '  Variables: PYTHON, PIP_EXTRA_ARGS (set-up), PYTEST_ARGS (test), BENCH_ARGS (bench)'
+	@echo '  Variables: PYTHON, PIP_EXTRA_ARGS (set-up), PYTEST_ARGS (test)'
 
 setup: ## Make .venv with all dependencies, and a Vulkan driver where there is none
 	@bash ops/setup.sh
@@ -30,9 +29,6 @@ test-all: ## Run the slow tests as well
 
 check: setup ## Check format, lint, types, and unit tests with branch coverage
 	@bash ops/check.sh
-
-bench: setup ## Measure this project against what one would use instead
-	@.venv/bin/slotfilm bench $(BENCH_ARGS)
 
 doctor: setup ## Show what this machine can do, with a fix for each lack
 	@.venv/bin/slotfilm doctor

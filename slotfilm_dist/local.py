@@ -62,8 +62,7 @@ class LocalBackend:
     def __init__(self, config: RunConfig) -> None:
         self._config = config
         self._device = learner_device(config)
-        # All cores at once would be slower: SAC's products are small, and threads that wait for each other spin.
-        torch.set_num_threads(config.runtime.learner_threads or max(1, int(usable_cores()) // 2))
+        self._use_threads(all_cores=False)
         self._training_env: WristEnv | None = None
         self._playing_env: WristEnv | None = None
         self._learner: Learner | None = None
@@ -95,6 +94,7 @@ class LocalBackend:
 
     def pretrain(self, dataset: Path, artifact: Path) -> Iterator[dict[str, float]]:
         """Pre-train and write the result, continuing what an interrupted pre-training left."""
+        self._use_threads(all_cores=True)
         learner = self._learner = Learner(self._config, self.action_dim, self._device)
         learner.begin_pretraining(open_dataset(dataset, dataset_hash(self._config), verify=False))
         unfinished = artifact.with_name(artifact.name + ".unfinished")
@@ -107,6 +107,7 @@ class LocalBackend:
                 write_checkpoint(unfinished, learner.pretrain_state())
                 saved_at = time.monotonic()
         write_checkpoint(artifact, learner.pretrain_state())
+        self._use_threads(all_cores=False)
 
     def begin_training(self, dataset: Path, pretrained: Path | None, resume_from: Path | None) -> dict[str, Any]:
         """Build learner, replay, limiter and rollouts; give back the checkpoint's values."""
@@ -133,8 +134,10 @@ class LocalBackend:
         if values and snapshot is not None and (snapshot / MANIFEST).exists():
             self._store.load(read_snapshot(snapshot))
         else:
+            self._use_threads(all_cores=True)
             for block in learner.stored_blocks(data):
                 self._store.insert(block)
+            self._use_threads(all_cores=False)
         self._limiter = RateLimiter(
             config.schedule.updates_per_step,
             min_steps=max(config.replay.min_steps, config.schedule.random_steps),
@@ -278,6 +281,14 @@ class LocalBackend:
             return ExpertPolicy(env)
         learner = self._trained()
         return AgentPolicy(learner.encoder, learner.sac.actor, seed, deterministic=True)
+
+    def _use_threads(self, *, all_cores: bool) -> None:
+        """Threads of torch: all cores for the backbone's large products, half of them for the small ones of SAC.
+
+        More would be slower there: threads that wait for each other spin.
+        """
+        cores = int(usable_cores())
+        torch.set_num_threads(self._config.runtime.learner_threads or max(1, cores if all_cores else cores // 2))
 
     def _trained(self) -> Learner:
         assert self._learner is not None, "begin_training comes first"

@@ -84,6 +84,7 @@ def _refusal(fields: Sequence[str], shown: str) -> str:
             return f"unknown field --{name}" + (f"; did you mean --{near[0]}?" if near else "; --fields lists them all")
     lines = [line.strip(" |│╭╮╰╯─\n") for line in shown.splitlines()]
     text = " ".join(line for line in lines if line and "--help" not in line)
+    text = re.sub(r"^(Invalid choice|Unrecognized options|Missing value|Value error)\s+", "", text)
     match = re.search(r"Error parsing (\S+): (.*?)(?: Argument helptext:.*)?$", text)
     if match is None:
         return text
