@@ -52,6 +52,14 @@ class Backend(Protocol):
         """
         ...
 
+    def load_agent(self, checkpoints: Path) -> int:
+        """Build the agent of a run's newest checkpoint, to play with; gives the environment steps it learned from.
+
+        Raises:
+            ValueError: there is no checkpoint that can be used.
+        """
+        ...
+
     def train(self, should_stop: Callable[[], bool]) -> Iterator[TrainReport]:
         """Train until the schedule's end, or until `should_stop`, reporting a few times a second."""
         ...

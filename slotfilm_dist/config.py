@@ -8,6 +8,7 @@ import dataclasses
 import difflib
 import hashlib
 import json
+import math
 import typing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -44,13 +45,13 @@ def check(ok: bool, name: str, value: object, want: str) -> None:
 def _positive(section: str, obj: Any, *names: str) -> None:
     for name in names:
         value = getattr(obj, name)
-        check(value > 0, f"{section}.{name}", value, "must be greater than 0")
+        check(0 < value < math.inf, f"{section}.{name}", value, "must be greater than 0 and finite")
 
 
 def _not_negative(section: str, obj: Any, *names: str) -> None:
     for name in names:
         value = getattr(obj, name)
-        check(value >= 0, f"{section}.{name}", value, "must be 0 or more")
+        check(0 <= value < math.inf, f"{section}.{name}", value, "must be 0 or more and finite")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -114,7 +115,7 @@ class ObsConfig:
     """Standardise the state with mean and deviation of the random-policy data (the paper does not)."""
 
     def __post_init__(self) -> None:
-        _positive("obs", self, "num_objects")
+        _positive("obs", self, "num_objects", "state_dim")
         for name in self.state_fields:
             if name not in STATE_FIELD_DIMS:
                 near = difflib.get_close_matches(name, STATE_FIELD_DIMS, n=1)
@@ -469,10 +470,13 @@ class RuntimeConfig:
     """Steps a worker collects before it sends them."""
     publish_every: int = 50
     """Updates between weight snapshots."""
+    metrics_port: int = 9464
+    """Loopback port where Prometheus finds the run's metrics; 0 opens none. A taken port is stepped over."""
 
     def __post_init__(self) -> None:
         _positive("runtime", self, "num_workers", "worker_threads", "block_steps", "publish_every")
         _not_negative("runtime", self, "learner_threads")
+        check(0 <= self.metrics_port < 65536, "runtime.metrics_port", self.metrics_port, "must lie in [0, 65535]")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -604,6 +608,8 @@ def load_config(path: Path) -> RunConfig:
         raise ValueError(f"{path} does not exist; a run directory has a config.json") from None
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ValueError(f"{path} is not valid JSON: {error}") from None
+    if not isinstance(values, dict):
+        raise ValueError(f"{path} is no config: it must hold one JSON object of sections")
     try:
         return from_dict(RunConfig, values)
     except ValueError as error:

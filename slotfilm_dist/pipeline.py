@@ -1,5 +1,6 @@
 """A run from nothing to its report: collect, pre-train, train, evaluate. The same for every backend."""
 
+import contextlib
 import signal
 import time
 from collections import deque
@@ -21,7 +22,7 @@ from slotfilm_dist.progress import Phase, Progress
 from slotfilm_dist.replay.dataset import MANIFEST
 from slotfilm_dist.replay.dataset_writer import FrameDatasetWriter
 from slotfilm_dist.runs import RunDirectory
-from slotfilm_dist.sinks import FanOut, JsonLinesSink, TensorBoardSink
+from slotfilm_dist.sinks import ClosableSink, FanOut, JsonLinesSink, PrometheusSink, TensorBoardSink
 
 RECENT_EPISODES = 20
 """Episodes that the shown return is averaged over."""
@@ -68,6 +69,16 @@ class StopFlag:
                 signal.signal(number, handler)
 
 
+def open_sinks(run: RunDirectory) -> list[ClosableSink]:
+    """Where a run's metrics go: its own files, and Prometheus unless that is turned off."""
+    sinks: list[ClosableSink] = [JsonLinesSink(run.metrics), TensorBoardSink(run.path / "tensorboard")]
+    config = run.config
+    if config.runtime.metrics_port:
+        labels = {"run": run.path.name, "variant": config.variant, "seed": str(config.seed)}
+        sinks.append(PrometheusSink(config.runtime.metrics_port, labels))
+    return sinks
+
+
 class Pipeline:
     """Drives one run through its phases; each phase that is already done is skipped.
 
@@ -89,8 +100,9 @@ class Pipeline:
         self._progress = progress
         self._stop = stop
         self._status = run.read_status()
-        self._sink = FanOut([JsonLinesSink(run.metrics), TensorBoardSink(run.path / "tensorboard")])
+        self._sink = FanOut(open_sinks(run))
         self._began = time.monotonic() - float(self._status.get("time_s", 0.0))
+        self._best = float("-inf")
         self._returns: deque[float] = deque(maxlen=RECENT_EPISODES)
         self._solved: deque[bool] = deque(maxlen=RECENT_EPISODES)
 
@@ -107,8 +119,7 @@ class Pipeline:
             self._evaluate()
         finally:
             self._sink.close()
-            page = write_page(self._run.path)
-        return page
+        return write_page(self._run.path)
 
     def _collect(self) -> Path:
         """The random policy's data, from the artifacts where they are there."""
@@ -161,7 +172,7 @@ class Pipeline:
     def _train(self, dataset: Path, pretrained: Path | None) -> None:
         config = self._config
         if self._status.get("trained"):
-            self._backend.begin_training(dataset, pretrained, self._run.checkpoints)
+            self._backend.load_agent(self._run.checkpoints)
             return
         total = config.schedule.total_steps
         self._progress.begin("train", f"{config.variant}: {total} environment steps in all")
@@ -176,8 +187,10 @@ class Pipeline:
         for report in self._backend.train(self._stop):
             self._note(report)
             if config.evaluation.every_steps and next_evaluation <= report.env_steps < total and not self._stop():
-                self._evaluate_now(report)
-                next_evaluation = report.env_steps + config.evaluation.every_steps
+                # A signal only breaks the evaluation off: training then stops by itself where its episode ends.
+                with contextlib.suppress(Interrupted):
+                    self._evaluate_now(report)
+                    next_evaluation = report.env_steps + config.evaluation.every_steps
             if report.updates >= next_save:
                 self._save(report, next_evaluation, with_replay=False)
                 next_save = report.updates + config.checkpoint.every_updates

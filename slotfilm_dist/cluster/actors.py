@@ -35,9 +35,7 @@ class HubActor:
         self._hub = Hub(limiter, schedule.total_steps, config.runtime.num_workers)
 
     @ray.method(concurrency_group="workers")
-    def admit_steps(
-        self, notice: BlockNotice, stored: Sequence[BlockKey], held_version: int, timeout_s: float
-    ) -> Any:
+    def admit_steps(self, notice: BlockNotice, stored: Sequence[BlockKey], held_version: int, timeout_s: float) -> Any:
         return self._hub.admit_steps(notice, stored, held_version, timeout_s)
 
     @ray.method(concurrency_group="learner")
@@ -53,9 +51,7 @@ class HubActor:
 class ShardActor:
     """A `ShardRole` in a process; started again by Ray when it dies, with its last snapshot."""
 
-    def __init__(
-        self, config: RunConfig, schema: "ReplaySchema", index: int, folder: Path, *, resume: bool
-    ) -> None:
+    def __init__(self, config: RunConfig, schema: "ReplaySchema", index: int, folder: Path, *, resume: bool) -> None:
         from slotfilm_dist.cluster.shard_role import ShardRole, build_shard
 
         self._role = ShardRole(build_shard(config, schema, index), folder)
@@ -175,4 +171,3 @@ CONCURRENCY: dict[type, dict[str, int]] = {
     PlayerActor: {},
 }
 """Threads of each group of an actor's methods; the rest share one thread."""
-

@@ -1,32 +1,35 @@
 """The roles of a run as processes on a Ray cluster, behind the same interface as one process."""
 
 import re
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from slotfilm_dist.backend import Player, TrainReport
-from slotfilm_dist.cluster.clients import HubClient, LearnerClient, ReplayClient, ShardClient, WorkerClient
+from slotfilm_dist.cluster.clients import HubClient, LearnerClient, ReplayClient, ShardClient
 from slotfilm_dist.cluster.evaluation import EvaluationPool
 from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError, RunFailedError
-from slotfilm_dist.cluster.messages import AgentSetup
-from slotfilm_dist.cluster.placement import plan, share_for_more
+from slotfilm_dist.cluster.messages import AgentSetup, LearnerStatus
+from slotfilm_dist.cluster.placement import plan
 from slotfilm_dist.cluster.reporting import Reporter
 from slotfilm_dist.cluster.session import Session
-from slotfilm_dist.cluster.system import ShardWatch, Supervisor
+from slotfilm_dist.cluster.system import ShardWatch
+from slotfilm_dist.cluster.workforce import Workforce
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.contracts import VectorEnv
 from slotfilm_dist.machine import usable_cores
 from slotfilm_dist.messages import EpisodeSummary, TransitionBlock
-from slotfilm_dist.replay.snapshot import MANIFEST
 from slotfilm_dist.seeds import Role, role_seed
 
-TICK_S = 0.25
-"""Pause of the caretaker between two looks at all roles."""
+SLICE_S = 0.1
+"""Waits for a stop are cut in slices of this length."""
 REPORT_S = 1.0
 """Seconds between reports of training."""
+STOP_S = 5.0
+"""Time that the learner gets to finish its update."""
+LEARNER_SILENCE_S = 60.0
+"""Time without an answer after which the learner counts as lost."""
 SNAPSHOT_S = 600.0
 """Seconds between snapshots of replay in the background."""
 PRETRAIN_CHUNK = 10
@@ -35,8 +38,8 @@ PRETRAIN_SAVE_S = 60.0
 """Seconds between checkpoints of an unfinished pre-training."""
 LONG_S = 3600.0
 """Longest wait for what depends on the size of data: reading, encoding, writing."""
-MAX_LEARNER_FAILURES = 3
-"""Losses of the learner without a report of progress in between before the run is given up."""
+MAX_LEARNER_RESTARTS = 10
+"""Losses of the learner before the run is given up."""
 INCARNATIONS_PER_START = 100_000
 """Incarnations of one start of a run; the next start counts on from a higher number than any before."""
 
@@ -76,53 +79,33 @@ class RayBackend:
         limits: Any = None,
         snapshot_s: float = SNAPSHOT_S,
     ) -> None:
-        self._config, self._run, self._make_env, self._limits = config, run.resolve(), make_env, limits
-        self._snapshot_s = snapshot_s
-        self._session = Session()
+        self._config, self._run, self._make_env = config, run.resolve(), make_env
         self._learner: LearnerClient | None = None
-        self._shards: list[ShardClient] = []
-        self._watch: ShardWatch | None = None
-        self._caretaker: threading.Thread | None = None
-        self._closing = threading.Event()
-        self._failure: RunFailedError | None = None
+        self._hub: HubClient | None = None
+        self._workforce: Workforce | None = None
         self._pool: EvaluationPool | None = None
+        self._shards: list[ShardClient] = []
         self._setup: AgentSetup | None = None
-        self._training = False
+        self._learner_restarts = 0
+        self._session = Session()
         try:
             self._placement = plan(config, self._session.nodes())
             namespace = namespace_of(self._run)
             starts = self._session.write_cluster_file(self._run, namespace)
             self._hub = HubClient.launch(config, namespace)
-            self._num_launched = 0
-            self._supervisor = Supervisor(
-                self._launch_worker, self._employ, self._settle, starts * INCARNATIONS_PER_START
+            self._workforce = Workforce(
+                *(config, self._session, self._hub, make_env, limits, self._placement.share_cpus),
+                first_incarnation=starts * INCARNATIONS_PER_START,
+                snapshot_s=snapshot_s,
             )
-            self._supervisor.scale(config.runtime.num_workers)
-            self._caretaker = threading.Thread(target=self._take_care, name="caretaker", daemon=True)
-            self._caretaker.start()
-            self.action_dim, self.reward_term_names = self._describe()
+            self.action_dim, self.reward_term_names = self._workforce.describe()
         except BaseException:
             self.close()
             raise
 
     def random_blocks(self, num_steps: int, start: int) -> Iterator[TransitionBlock]:
         """Blocks of the random policy from all workers; a continued collection has random streams of its own."""
-        requests: dict[WorkerClient, Any] = {}
-        done = 0
-        while done < num_steps:
-            self._check()
-            clients = self._workers()
-            requests = {client: request for client, request in requests.items() if client in clients}
-            for client in clients:
-                request = requests.setdefault(client, None) or client.begin_take(REPORT_S)
-                try:
-                    blocks = client.taken(request, TICK_S / 10)
-                except RoleLostError:
-                    blocks = []  # the caretaker replaces it
-                requests[client] = request if blocks is None else None
-                for block in blocks or ():
-                    done += block.num_steps
-                    yield block
+        yield from self._workers.random_blocks(num_steps)
 
     def pretrain(self, dataset: Path, artifact: Path) -> Iterator[dict[str, float]]:
         """Pre-train in the learner's process, continuing what an interrupted pre-training left."""
@@ -134,7 +117,7 @@ class RayBackend:
             metrics, done = learner.call("pretrain", PRETRAIN_CHUNK, timeout_s=LONG_S)
             if metrics:
                 yield metrics
-            self._check()
+            self._workers.check()
             if time.monotonic() - saved_at > PRETRAIN_SAVE_S:
                 learner.call("save_pretraining", artifact, finished=False, timeout_s=LONG_S)
                 saved_at = time.monotonic()
@@ -143,70 +126,61 @@ class RayBackend:
     def begin_training(self, dataset: Path, pretrained: Path | None, resume_from: Path | None) -> dict[str, Any]:
         """Build the learner in its process; replay follows in `train`."""
         self._sources = dataset.resolve(), pretrained.resolve() if pretrained else None
-        self._resume_from = resume_from.resolve() if resume_from else None
+        self._resumed = resume_from is not None
         learner = self._learner or self._launch_learner()
-        values, self._schema, self._random_steps = learner.call(
-            "begin", *self._sources, self._resume_from, timeout_s=LONG_S
+        values, self._schema, random_steps = learner.call(
+            "begin", *self._sources, resume_from.resolve() if resume_from else None, timeout_s=LONG_S
         )
         if values:
-            self._hub.load(values["limiter"])
+            self._counts.load(values["limiter"])
         else:
-            self._hub.count_random_steps(self._random_steps)
-        self._setup = self._hub.agent_setup()
+            self._counts.count_random_steps(random_steps)
+        self._setup = self._counts.agent_setup()
         return values
 
     def train(self, should_stop: Callable[[], bool]) -> Iterator[TrainReport]:
         """Train until the schedule's end, or until `should_stop`, reporting once a second."""
         self._build_replay()
-        reporter = Reporter(self._config)
-        self._start_learning()
-        self._training = True
-        self._supervisor.employ_again()
-        failures: list[int] = []
+        workers, reporter = self._workers, Reporter(self._config)
+        self._connect_learner()
+        assert self._setup is not None, "begin_training comes first"
+        workers.train(self._shards, self._watch, self._setup)
         finished = False
         while not (finished or should_stop()):
-            until = time.monotonic() + REPORT_S
-            while time.monotonic() < until and not should_stop():
-                time.sleep(TICK_S / 2)
-            self._check()
-            report = self._report(reporter)
-            if report is None:
-                failures = [*[at for at in failures if at >= self._hub.status().updates], self._hub.status().updates]
-                self._replace_learner(len(failures))
-                continue
+            _wait(REPORT_S, should_stop)
+            workers.check()
+            status = self._learner_status()
+            report = self._report(reporter, status)
             yield report
             self._close_players()
-            status = self._hub.status()
-            finished = status.finished and status.updates_owed == 0 and report.updates >= status.updates
-        self._training = False
-        self._supervisor.stop()
-        if not finished:
-            self._learning().call("stop", 10.0, timeout_s=20.0)
-        report = self._report(reporter)
-        if finished:
-            self._learning().call("stop", 10.0, timeout_s=20.0)
-        if report is not None:
-            yield report
+            counts = self._counts.status()
+            finished = counts.finished and counts.updates_owed == 0 and status.updates >= counts.updates
+        workers.stop()
+        self._learning.call("stop", STOP_S, timeout_s=2 * STOP_S)
+        self._watch.tick()
+        yield self._report(reporter, self._learner_status())
 
     def play(self, player: Player, seeds: Sequence[int]) -> Iterator[EpisodeSummary]:
         """Play episodes in processes of their own; training goes on meanwhile."""
         camera = player == "agent" and self._config.encoder.uses_image
-        workers = self._config.runtime.num_workers
-        pool = self._players(max(1, min(len(seeds), workers // 2 if self._training else workers)))
-        snapshot = self._hub.latest(-1) if player == "agent" else None
+        num_workers = len(self._workers.supervisor.handles)
+        # While training goes on, its workers keep most of the cores.
+        size = num_workers // 2 if num_workers else self._config.runtime.num_workers
+        pool = self._players(max(1, min(len(seeds), size)))
+        snapshot = self._counts.latest(-1) if player == "agent" else None
         yield from pool.play(player, seeds, camera=camera, setup=self._setup, snapshot=snapshot)
 
     def record(self, player: Player, seed: int, video: Path, film_strip: Path) -> EpisodeSummary:
         """Play one episode with the camera on and write its video and film strip."""
-        snapshot = self._hub.latest(-1) if player == "agent" else None
+        snapshot = self._counts.latest(-1) if player == "agent" else None
         return self._players(1).record(
             player, seed, video.resolve(), film_strip.resolve(), setup=self._setup, snapshot=snapshot
         )
 
     def save(self, folder: Path, values: Mapping[str, Any], *, with_replay: bool, best: bool = False) -> int:
         """Write a checkpoint in the learner's process, and replay beside it."""
-        own = {"limiter": self._hub.save(0)}
-        size, _ = self._learning().call("save", folder.resolve(), own | dict(values), best=best, timeout_s=LONG_S)
+        own = {"limiter": self._counts.save(0)}
+        size, _ = self._learning.call("save", folder.resolve(), own | dict(values), best=best, timeout_s=LONG_S)
         if with_replay and not best:
             requests = [(shard, shard.begin_snapshot()) for shard in self._shards]
             for shard, request in requests:
@@ -215,100 +189,136 @@ class RayBackend:
 
     def close(self) -> None:
         """Stop workers, then the learner, then replay, then Ray."""
-        self._closing.set()
-        if self._caretaker is not None:
-            self._caretaker.join(TICK_S + 10)
-            self._caretaker = None
         self._close_players()
-        if hasattr(self, "_supervisor"):
-            self._attempt(self._supervisor.stop)
+        if self._workforce is not None:
+            _attempt(self._workforce.close)
+            self._workforce = None
         if self._learner is not None:
-            self._attempt(lambda: self._learning().call("stop", 3.0, timeout_s=5.0))
-            self._learner.kill()
-            self._learner = None
+            learner, self._learner = self._learner, None
+            _attempt(lambda: learner.call("stop", STOP_S / 2, timeout_s=STOP_S))
+            learner.kill()
         for shard in self._shards:
             shard.kill()
         self._shards = []
-        if hasattr(self, "_hub"):
-            self._attempt(self._hub.close)
+        if self._hub is not None:
+            _attempt(self._hub.close)
             self._hub.kill()
+            self._hub = None
         self._session.close()
 
-    @staticmethod
-    def _attempt(ending: Callable[[], Any]) -> None:
-        """End a role; what is gone already needs no ending."""
+    @property
+    def _workers(self) -> Workforce:
+        assert self._workforce is not None, "the backend is closed"
+        return self._workforce
+
+    @property
+    def _counts(self) -> HubClient:
+        assert self._hub is not None, "the backend is closed"
+        return self._hub
+
+    @property
+    def _learning(self) -> LearnerClient:
+        assert self._learner is not None, "begin_training comes first"
+        return self._learner
+
+    def _launch_learner(self) -> LearnerClient:
+        threads = self._config.runtime.learner_threads or max(1, int(usable_cores()) // 2)
+        self._learner = LearnerClient.launch(
+            self._config,
+            self.action_dim,
+            threads,
+            self._counts,
+            num_cpus=self._placement.share_cpus,
+            gpu=self._placement.gpu,
+        )
+        return self._learner
+
+    def _build_replay(self) -> None:
+        """Start the shards, with what a run that goes on had stored, or with the random policy's data."""
+        folder = self._run / "checkpoints" / "replay"
+        self._shards = [
+            ShardClient.launch(self._config, self._schema, index, folder / f"shard-{index:02d}", resume=self._resumed)
+            for index in range(self._config.replay.num_shards)
+        ]
+        stored = [shard.beat(LONG_S).stats.num_steps for shard in self._shards]
+        self._learning.call("connect", self._replay_client(), timeout_s=LONG_S)
+        if sum(stored) == 0:
+            self._learning.call("refill", self._sources[0], timeout_s=LONG_S)
+        self._watch = ShardWatch(self._shards, self._config.replay.min_steps, self._counts.start_over)
+
+    def _replay_client(self) -> ReplayClient:
+        return ReplayClient(self._shards, role_seed(self._config.seed, Role.REPLAY, 0, self._learner_restarts))
+
+    def _connect_learner(self) -> None:
+        self._learning.call("start", timeout_s=LONG_S)
+
+    def _learner_status(self) -> LearnerStatus:
+        """How the learner does; a lost one is replaced and goes on from the last checkpoint.
+
+        Raises:
+            RunFailedError: it failed by itself, or was lost too often.
+        """
         try:
-            ending()
-        except (RoleLostError, RoleSilentError, AssertionError):
-            return
+            status = self._learning.status(LEARNER_SILENCE_S)
+        except (RoleLostError, RoleSilentError) as error:
+            return self._replace_learner(error)
+        if status.error:
+            raise RunFailedError(f"the learner stopped: {status.error}; go on with --resume")
+        return status
 
-    def _launch_worker(self, worker_id: int) -> WorkerClient:
-        planned = self._config.runtime.num_workers
-        share = self._placement.share_cpus
-        if self._num_launched >= planned and worker_id >= planned:
-            share = min(share, share_for_more(1, self._session.available_cpus()))
-        self._num_launched += 1
-        return WorkerClient.launch(self._config, worker_id, self._make_env, self._limits, share)
+    def _replace_learner(self, error: Exception) -> LearnerStatus:
+        self._learner_restarts += 1
+        if self._learner_restarts > MAX_LEARNER_RESTARTS:
+            raise RunFailedError(
+                f"the learner was lost {self._learner_restarts} times, last: {error}; --resume goes on"
+            )
+        self._learning.kill()
+        learner = self._launch_learner()
+        folder = self._run / "checkpoints"
+        found = folder if any(folder.glob("updates-*")) else None
+        learner.call("begin", *self._sources, found, timeout_s=LONG_S)
+        status = learner.status()
+        # What was granted and is lost with the process is due again.
+        self._counts.refund_updates(self._counts.status().updates - status.updates)
+        learner.call("connect", self._replay_client(), timeout_s=LONG_S)
+        learner.call("start", timeout_s=LONG_S)
+        return status
 
-    def _employ(self, handle: Any, incarnation: int) -> None:
-        if self._training and self._setup is not None:
-            seed = role_seed(self._config.seed, Role.REPLAY, handle.worker_id + 1_000_000, incarnation)
-            handle.train(incarnation, self._hub, ReplayClient(self._shards, seed), self._setup)
-        else:
-            handle.collect_randomly(incarnation)
+    def _report(self, reporter: Reporter, status: LearnerStatus) -> TrainReport:
+        supervisor, counts = self._workers.supervisor, self._counts.status()
+        metrics = reporter.metrics(
+            counts,
+            status,
+            supervisor.beats(),
+            list(self._watch.beats.values()),
+            supervisor.restarts,
+            self._watch.num_restarts,
+        )
+        metrics["learner_restarts_total/crash"] = float(self._learner_restarts)
+        episodes = tuple(self._counts.take_episodes())
+        return TrainReport(env_steps=counts.env_steps, updates=status.updates, metrics=metrics, episodes=episodes)
 
-    def _settle(self, worker_id: int, incarnation: int) -> None:
-        """Take back the steps that a lost worker was granted and that no shard holds."""
-        asked = self._hub.pending(worker_id, incarnation)
-        stored = []
-        for shard in self._shards:
-            try:
-                stored += shard.fence(worker_id, incarnation, [k for k in asked if self._is_of(k, shard)])
-            except (RoleLostError, RoleSilentError):
-                continue  # what it held of this worker since its snapshot is lost with it
-        self._hub.settle(worker_id, incarnation, stored)
+    def _players(self, size: int) -> EvaluationPool:
+        if self._pool is None or self._pool.size < size:
+            self._close_players()
+            self._pool = EvaluationPool(self._config, self._make_env, self._placement.share_cpus, size)
+        return self._pool
 
-    def _is_of(self, key: Any, shard: ShardClient) -> bool:
-        from slotfilm_dist.replay.ledger import shard_of
+    def _close_players(self) -> None:
+        if self._pool is not None:
+            self._pool.close()
+            self._pool = None
 
-        return shard_of(key.worker_id, key.sequence, len(self._shards)) == shard.index
 
-    def _workers(self) -> list[WorkerClient]:
-        return [handle for handle in self._supervisor.handles if isinstance(handle, WorkerClient)]
+def _wait(seconds: float, should_stop: Callable[[], bool]) -> None:
+    until = time.monotonic() + seconds
+    while time.monotonic() < until and not should_stop():
+        time.sleep(SLICE_S)
 
-    def _describe(self) -> tuple[int, tuple[str, ...]]:
-        """Size of an action and the reward's terms, from the first worker that has built its environment."""
-        while True:
-            self._check()
-            for client in self._workers()[:1]:
-                try:
-                    described = client.begin_describe(REPORT_S)
-                except RoleLostError:
-                    time.sleep(TICK_S)
-                    continue
-                if described is not None:
-                    return described
 
-    def _take_care(self) -> None:
-        """The caretaker's loop: consumes beats, produces restarts and snapshots; ends with `close` or a failure."""
-        snapshots: list[Any] = []
-        next_snapshot = time.monotonic() + self._snapshot_s
-        while not self._closing.wait(TICK_S):
-            try:
-                self._supervisor.tick()
-                wanted = self._hub.status().wanted_workers
-                if wanted != len(self._supervisor.handles) and not self._idle_after_training():
-                    self._supervisor.scale(wanted)
-                self._hub.note_alive(self._supervisor.num_alive)
-                if self._watch is not None:
-                    self._watch.tick()
-                    if self._training and time.monotonic() >= next_snapshot:
-                        snapshots = [shard.begin_snapshot() for shard in self._shards]
-                        next_snapshot = time.monotonic() + self._snapshot_s
-            except RunFailedError as error:
-                self._failure = error
-                return
-            except (RoleLostError, RoleSilentError) as error:
-                self._failure = RunFailedError(f"{error}; the run stopped, go on with --resume")
-                return
-        del snapshots
+def _attempt(ending: Callable[[], Any]) -> None:
+    """End a role; what is gone already needs no ending."""
+    try:
+        ending()
+    except (RoleLostError, RoleSilentError):
+        return

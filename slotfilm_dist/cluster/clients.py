@@ -206,7 +206,9 @@ class ShardClient:
         self._last: ShardBeat | None = None
 
     @classmethod
-    def launch(cls, config: RunConfig, schema: ReplaySchema, index: int, folder: Path, *, resume: bool) -> "ShardClient":
+    def launch(
+        cls, config: RunConfig, schema: ReplaySchema, index: int, folder: Path, *, resume: bool
+    ) -> "ShardClient":
         """Start a shard; Ray replaces its process when it dies."""
         actor = _launch(
             *(ShardActor, config, schema, index, folder),
@@ -415,7 +417,7 @@ class WorkerClient:
         self._last = None
         self._actor.collect_randomly.remote(incarnation)
 
-    def begin_describe(self, timeout_s: float) -> tuple[int, tuple[str, ...]] | None:
+    def describe(self, timeout_s: float) -> tuple[int, tuple[str, ...]] | None:
         """Size of an action and the reward's terms, or None while the environment is being built."""
         return _answer(
             self._actor.describe.remote(timeout_s), self.name, "its environment to be built", timeout_s + ANSWER_S

@@ -145,7 +145,5 @@ class BlockSender:
                 if self._closing.is_set():
                     return
                 time.sleep(RETRY_S)
-        self._stored.append(
-            BlockKey(worker_id=block.worker_id, incarnation=block.incarnation, sequence=block.sequence)
-        )
+        self._stored.append(BlockKey(worker_id=block.worker_id, incarnation=block.incarnation, sequence=block.sequence))
         self._waiting_for = "room for a block"

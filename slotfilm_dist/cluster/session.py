@@ -97,7 +97,7 @@ class Session:
             token.touch(mode=0o600)
             token.write_text(secrets.token_hex(32))
             self._set("RAY_AUTH_TOKEN_PATH", str(token))
-            self._set("RAY_AUTH_MODE", "token")
+            self._environment.setdefault("RAY_AUTH_MODE", None)  # Ray turns it on by itself where a token is there
         ray.init(
             num_cpus=num_cpus,
             object_store_memory=min(STORE_BYTES, usable_memory_bytes() // 4),
@@ -137,13 +137,15 @@ def joined(run: Path) -> Iterator[str]:
     if not values:
         raise ValueError(f"{run} has no {CLUSTER_FILE}: the run does not use Ray, or has not started yet")
     if values["token_path"]:
-        os.environ["RAY_AUTH_MODE"], os.environ["RAY_AUTH_TOKEN_PATH"] = "token", values["token_path"]
+        os.environ["RAY_AUTH_TOKEN_PATH"] = values["token_path"]
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     try:
         ray.init(address=values["address"], log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0]
-        raise ValueError(f"{run}: its cluster at {values['address']} does not answer ({reason}); is it running?") from None
+        raise ValueError(
+            f"{run}: its cluster at {values['address']} does not answer ({reason}); is it running?"
+        ) from None
     try:
         yield values["namespace"]
     finally:

@@ -101,6 +101,7 @@ class Supervisor:
         self._next_incarnation = first_incarnation
         self._members: dict[int, _Member] = {}
         self._lock = threading.RLock()
+        self._stopped = False
         self.restarts: Counter[str] = Counter()
         self.last_restart = ""
 
@@ -123,8 +124,10 @@ class Supervisor:
             return [member.beat for member in self._members.values() if member.beat is not None]
 
     def scale(self, num_workers: int) -> None:
-        """Start or stop workers until so many should run."""
+        """Start or stop workers until so many should run; none any more after `stop`."""
         with self._lock:
+            if self._stopped:
+                return
             for worker_id in range(num_workers):
                 if worker_id not in self._members:
                     self._start(worker_id, [])
@@ -155,8 +158,9 @@ class Supervisor:
                     self._replace(member, *fault)
 
     def stop(self) -> None:
-        """Stop all workers: those that do not end in time are killed."""
+        """Stop all workers for good; those that do not end in time are killed."""
         with self._lock:
+            self._stopped = True
             self._dismiss(list(self._members))
 
     def _fault(self, member: _Member) -> tuple[str, str] | None:

@@ -49,16 +49,21 @@ class WristEnv:
 
             kwargs |= {"sensor_configs": WristCamera.sensor_configs(config.env)}
             backend = render_device(config.env.render_backend)
-        self._env: Any = gym.make(
-            self._task.env_id,
-            num_envs=num_envs,
-            obs_mode="none",
-            reward_mode="dense" if own else "normalized_dense",
-            robot_uids=self._task.robot,
-            sim_backend="physx_cuda" if config.env.sim_backend == "gpu" else "physx_cpu",
-            render_backend=backend,
-            **kwargs,
-        ).unwrapped
+        try:
+            self._env: Any = gym.make(
+                self._task.env_id,
+                num_envs=num_envs,
+                obs_mode="none",
+                reward_mode="dense" if own else "normalized_dense",
+                robot_uids=self._task.robot,
+                sim_backend="physx_cuda" if config.env.sim_backend == "gpu" else "physx_cpu",
+                render_backend=backend,
+                **kwargs,
+            ).unwrapped
+        except AssertionError as error:
+            if "supported modes" not in str(error):
+                raise
+            raise ValueError(f"env.control_mode = {config.env.control_mode!r}: {error}") from None
         self.action_dim = int(self._env.single_action_space.shape[0])
         self.reward_term_names: tuple[str, ...] = OWN_TERMS if own else ("reward",)
         self._camera = WristCamera(self._env, config.env) if camera else None  # imported above, only where needed

@@ -1,5 +1,6 @@
 """Checkpoints on disk: tensors as safetensors, everything else as JSON, checked by hash before use. Never pickle."""
 
+import hashlib
 import json
 import shutil
 from collections.abc import Mapping
@@ -12,7 +13,14 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from slotfilm_dist.atomic import FileDigest, check_file, replace_directory, write_atomic
+from slotfilm_dist.atomic import (
+    RETIRED_SUFFIX,
+    FileDigest,
+    check_file,
+    recover_directory,
+    replace_directory,
+    write_atomic,
+)
 
 FORMAT = 1
 """Raised when an older reader could misread what is written."""
@@ -45,7 +53,8 @@ def write_checkpoint(directory: Path, checkpoint: Checkpoint) -> int:
             "tensors": {"num_bytes": digest.num_bytes, "sha256": digest.sha256},
             "values": checkpoint.values,
         }
-        write_atomic(folder / MANIFEST, [json.dumps(manifest, indent=1).encode()])
+        signed = manifest | {"sha256": _signature(manifest)}
+        write_atomic(folder / MANIFEST, [json.dumps(signed, indent=1).encode()])
     return digest.num_bytes
 
 
@@ -83,9 +92,15 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: damaged ({error})") from None
     if not isinstance(manifest, dict) or not manifest.keys() >= {"format", "config_hash", "tensors", "values"}:
         raise ValueError(f"{path}: damaged, fields are missing")
+    if manifest.pop("sha256", None) != _signature(manifest):
+        raise ValueError(f"{path}: damaged, its SHA-256 differs from the one it states")
     if manifest["format"] != FORMAT:
         raise ValueError(f"{path}: written in format {manifest['format']}, this version reads {FORMAT}")
     return manifest
+
+
+def _signature(manifest: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
 
 
 class CheckpointStore:
@@ -128,6 +143,8 @@ class CheckpointStore:
         return None
 
     def _numbered(self) -> list[Path]:
+        for moved_aside in self.folder.glob(f"updates-*{RETIRED_SUFFIX}"):
+            recover_directory(moved_aside.with_name(moved_aside.name.removesuffix(RETIRED_SUFFIX)))
         return sorted(path for path in self.folder.glob("updates-*") if path.name[8:].isdigit())
 
 

@@ -233,6 +233,9 @@ class SacLearner:
             _load_module(module, name, tensors)
         for name, optimiser in self._optimisers().items():
             _load_optimiser(optimiser, name, tensors)
+        for name in ("log_temperature", "noise_state"):
+            if name not in tensors:
+                raise ValueError(f"checkpoint: {name} is missing")
         with torch.no_grad():
             self.log_temperature.copy_(tensors["log_temperature"])
         self._noise.set_state(tensors["noise_state"])
@@ -271,5 +274,9 @@ def _load_optimiser(optimiser: torch.optim.Optimizer, name: str, tensors: Mappin
         if owner == name:
             index, _, field = rest.partition(".")
             state.setdefault(int(index), {})[field] = value
+    fields = {field for moments in state.values() for field in moments}
+    for index, moments in state.items():
+        if lacking := sorted(fields - moments.keys()):
+            raise ValueError(f"checkpoint: {name}.{index}.{lacking[0]} is missing")
     current = optimiser.state_dict()
     optimiser.load_state_dict({"state": state, "param_groups": current["param_groups"]})

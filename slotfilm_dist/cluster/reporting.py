@@ -1,0 +1,104 @@
+"""Turns the counters of all roles into the metrics of one report."""
+
+import time
+from collections.abc import Mapping, Sequence
+
+from slotfilm_dist.cluster.messages import HubStatus, LearnerStatus, ShardBeat, WorkerBeat
+from slotfilm_dist.config import RunConfig
+
+
+class Reporter:
+    """Remembers the last report, for rates.
+
+    Args:
+        config: the run.
+        clock: seconds that only grow.
+    """
+
+    def __init__(self, config: RunConfig, clock=time.monotonic) -> None:  # noqa: ANN001  inferred from its default
+        self._config = config
+        self._clock = clock
+        self._last: tuple[float, HubStatus, LearnerStatus, float] | None = None
+
+    def metrics(
+        self,
+        hub: HubStatus,
+        learner: LearnerStatus,
+        workers: Sequence[WorkerBeat],
+        shards: Sequence[ShardBeat],
+        restarts: Mapping[str, int],
+        shard_restarts: int,
+    ) -> dict[str, float]:
+        """Values by the metric catalogue's names."""
+        now, waited_s = self._clock(), sum(beat.waited_s for beat in workers)
+        values = (
+            learner.metrics
+            | self._of_workers(hub, workers, waited_s)
+            | self._of_replay(hub, shards)
+            | self._of_limiter(hub)
+            | {f"worker_restarts_total/{reason}": float(count) for reason, count in restarts.items()}
+            | {"replay_restarts_total/crash": float(shard_restarts)}
+        )
+        if self._last is not None:
+            then, hub_then, learner_then, waited_then = self._last
+            elapsed = max(now - then, 1e-6)
+            learner_waited = learner.metrics.get("learner_wait_s_total", 0.0)
+            learner_waited -= learner_then.metrics.get("learner_wait_s_total", 0.0)
+            values |= {
+                "worker_env_steps_per_s": max(0, hub.env_steps - hub_then.env_steps) / elapsed,
+                "learner_updates_per_s": max(0, learner.updates - learner_then.updates) / elapsed,
+                "worker_wait_share": _share((waited_s - waited_then) / (elapsed * max(1, len(workers)))),
+                "learner_wait_share": _share(learner_waited / elapsed),
+            }
+        self._last = now, hub, learner, waited_s
+        return values
+
+    def _of_workers(self, hub: HubStatus, workers: Sequence[WorkerBeat], waited_s: float) -> dict[str, float]:
+        by_worker = list(hub.steps_by_worker.values())
+        values = {
+            "worker_env_steps_total": float(hub.env_steps),
+            "worker_blocks_total": float(hub.num_blocks),
+            "worker_alive_count": float(hub.alive_workers),
+            "worker_wait_s_total": waited_s,
+        }
+        stepping = [beat.step_s for beat in workers if beat.step_s]
+        if stepping:
+            values["worker_sim_s"] = sum(stepping) / len(stepping)
+        if by_worker:
+            values["worker_least_share"] = min(by_worker) * len(by_worker) / max(1, sum(by_worker))
+        return values
+
+    def _of_replay(self, hub: HubStatus, shards: Sequence[ShardBeat]) -> dict[str, float]:
+        stats = [beat.stats for beat in shards]
+        drawn = sum(s.drawn.num_steps for s in stats)
+        values = {
+            "replay_stored_steps": float(sum(s.num_steps for s in stats)),
+            "replay_capacity_steps": float(self._config.replay.capacity),
+            "replay_stored_bytes": float(sum(s.ring_bytes * s.num_steps / max(1, s.capacity_steps) for s in stats)),
+            "replay_inserted_steps_total": float(sum(s.inserted_steps for s in stats)),
+            "replay_sampled_steps_total": float(drawn),
+            "replay_duplicate_blocks_total": float(sum(s.duplicate_blocks for s in stats)),
+            "replay_missing_blocks_total": float(sum(s.missing_blocks for s in stats)),
+            "replay_shards_alive_count": float(len(shards)),
+        }
+        if drawn:
+            values["replay_sample_age_steps"] = len(shards) * sum(s.drawn.age_steps for s in stats) / drawn
+            mean_version = sum(s.drawn.policy_version for s in stats) / drawn
+            values["replay_sample_age_updates"] = max(0.0, hub.updates - mean_version)
+        return values
+
+    def _of_limiter(self, hub: HubStatus) -> dict[str, float]:
+        return {
+            "limiter_ratio": hub.ratio,
+            "limiter_target_ratio": self._config.schedule.updates_per_step,
+            "limiter_waiting_workers_count": float(hub.waiting_workers),
+            "limiter_waiting_learner": float(hub.waiting_learner),
+            "weights_version": float(hub.weights_version),
+            "weights_age_updates": hub.weights_age_updates,
+            "weights_age_s": hub.weights_age_s,
+            "weights_published_total": float(hub.num_published),
+        }
+
+
+def _share(value: float) -> float:
+    return min(1.0, max(0.0, value))

@@ -1,0 +1,172 @@
+"""The workers of a run as the backend drives them: random policy first, training after, cared for all the time."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from slotfilm_dist.cluster.clients import HubClient, ReplayClient, ShardClient, WorkerClient
+from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError, RunFailedError
+from slotfilm_dist.cluster.messages import AgentSetup, BlockKey
+from slotfilm_dist.cluster.placement import share_for_more
+from slotfilm_dist.cluster.session import Session
+from slotfilm_dist.cluster.system import ShardWatch, Supervisor
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.messages import TransitionBlock
+from slotfilm_dist.replay.ledger import shard_of
+from slotfilm_dist.seeds import Role, role_seed
+
+TICK_S = 0.25
+"""Pause of the caretaker between two looks at all roles."""
+TAKE_S = 1.0
+"""Longest wait of one request for the random policy's blocks."""
+INSERT_STREAMS = 1_000_000
+"""Workers' replay clients draw from streams beyond those of the shards; they never sample, but have one."""
+
+
+class Workforce:
+    """Workers, and the caretaker thread that keeps them and the shards alive from the start to `close`.
+
+    Args:
+        config: the run.
+        session: the cluster.
+        hub: counts their steps.
+        make_env: builds an environment.
+        limits: how long workers may go without progress.
+        share_cpus: cores of each worker.
+        first_incarnation: higher than any of earlier starts of the run.
+        snapshot_s: seconds between snapshots of replay.
+    """
+
+    def __init__(
+        self,
+        config: RunConfig,
+        session: Session,
+        hub: HubClient,
+        make_env: Callable[..., Any],
+        limits: Any,
+        share_cpus: float,
+        first_incarnation: int,
+        snapshot_s: float,
+    ) -> None:
+        self._config, self._session, self._hub = config, session, hub
+        self._make_env, self._limits, self._share_cpus = make_env, limits, share_cpus
+        self._snapshot_s = snapshot_s
+        self._shards: Sequence[ShardClient] = ()
+        self._setup: AgentSetup | None = None
+        self._failure: RunFailedError | None = None
+        self._closing = threading.Event()
+        self.watch: ShardWatch | None = None
+        self.supervisor = Supervisor(self._launch, self._employ, self._settle, first_incarnation)
+        self.supervisor.scale(config.runtime.num_workers)
+        self._caretaker = threading.Thread(target=self._take_care, name="caretaker", daemon=True)
+        self._caretaker.start()
+
+    @property
+    def training(self) -> bool:
+        """The workers collect for replay."""
+        return self._setup is not None
+
+    def check(self) -> None:
+        """Raise `RunFailedError` if a role could not be kept alive."""
+        if self._failure is not None:
+            raise self._failure
+
+    def describe(self) -> tuple[int, tuple[str, ...]]:
+        """Size of an action and the reward's terms, from the first worker, once it has built its environment."""
+        while True:
+            self.check()
+            try:
+                described = self._clients()[0].describe(TAKE_S)
+            except (RoleLostError, RoleSilentError):
+                time.sleep(TICK_S)  # the caretaker replaces it
+                continue
+            if described is not None:
+                return described
+
+    def random_blocks(self, num_steps: int) -> Iterator[TransitionBlock]:
+        """The random policy's blocks, as they come from any worker."""
+        requests: dict[WorkerClient, Any] = {}
+        done = 0
+        while done < num_steps:
+            self.check()
+            clients = self._clients()
+            requests = {client: requests.get(client) or client.begin_take(TAKE_S) for client in clients}
+            for client in clients:
+                try:
+                    blocks = client.taken(requests[client], TICK_S / 10)
+                except RoleLostError:
+                    del requests[client]  # the caretaker replaces it
+                    continue
+                if blocks is not None:
+                    del requests[client]
+                for block in blocks or ():
+                    done += block.num_steps
+                    yield block
+
+    def train(self, shards: Sequence[ShardClient], watch: ShardWatch, setup: AgentSetup) -> None:
+        """Set all workers to collect for replay with the trained agent."""
+        self._shards, self.watch, self._setup = shards, watch, setup
+        self.supervisor.employ_again()
+
+    def stop(self) -> None:
+        """Stop all workers for good."""
+        self.supervisor.stop()
+
+    def close(self) -> None:
+        """Stop the caretaker, then all workers."""
+        self._closing.set()
+        self._caretaker.join()
+        self.stop()
+
+    def _clients(self) -> list[WorkerClient]:
+        return [handle for handle in self.supervisor.handles if isinstance(handle, WorkerClient)]
+
+    def _launch(self, worker_id: int) -> WorkerClient:
+        share = self._share_cpus
+        if worker_id >= self._config.runtime.num_workers:
+            share = min(share, share_for_more(1, self._session.available_cpus()))
+        return WorkerClient.launch(self._config, worker_id, self._make_env, self._limits, share)
+
+    def _employ(self, handle: Any, incarnation: int) -> None:
+        if self._setup is None:
+            handle.collect_randomly(incarnation)
+            return
+        seed = role_seed(self._config.seed, Role.REPLAY, INSERT_STREAMS + handle.worker_id, incarnation)
+        handle.train(incarnation, self._hub, ReplayClient(self._shards, seed), self._setup)
+
+    def _settle(self, worker_id: int, incarnation: int) -> None:
+        """Take back the steps that a lost worker was granted and that no shard holds."""
+        asked = self._hub.pending(worker_id, incarnation)
+        stored: list[BlockKey] = []
+        for shard in self._shards:
+            mine = [k for k in asked if shard_of(k.worker_id, k.sequence, len(self._shards)) == shard.index]
+            try:
+                stored += shard.fence(worker_id, incarnation, mine)
+            except (RoleLostError, RoleSilentError):
+                continue  # what it held of this worker since its snapshot is lost with it
+        self._hub.settle(worker_id, incarnation, stored)
+
+    def _take_care(self) -> None:
+        """The caretaker's loop: consumes beats, produces restarts and snapshots; ends with `close` or a failure."""
+        next_snapshot = time.monotonic() + self._snapshot_s
+        while not self._closing.wait(TICK_S):
+            try:
+                self.supervisor.tick()
+                self.supervisor.scale(self._hub.status().wanted_workers)
+                self._hub.note_alive(self.supervisor.num_alive)
+                if self.watch is not None:
+                    self.watch.tick()
+                    if time.monotonic() >= next_snapshot:
+                        for shard in self._shards:
+                            shard.begin_snapshot()
+                        next_snapshot = time.monotonic() + self._snapshot_s
+            except RunFailedError as error:
+                self._failure = error
+                return
+            except (RoleLostError, RoleSilentError) as error:
+                self._failure = RunFailedError(f"{error}; go on with --resume")
+                return
+            except Exception as error:  # a mistake of ours must stop the run, not the care alone
+                self._failure = RunFailedError(f"the caretaker failed: {type(error).__name__}: {error}")
+                return
