@@ -31,6 +31,10 @@ class Backend(Protocol):
     action_dim: int
     reward_term_names: tuple[str, ...]
 
+    def prepare(self) -> None:
+        """Find out, before anything is written, whether all that the run needs is there; raises ``ValueError``."""
+        ...
+
     def random_blocks(self, num_steps: int, start: int) -> Iterator[TransitionBlock]:
         """Blocks of the random policy, `num_steps` steps or a little more, after `start` steps that are there."""
         ...

@@ -67,6 +67,16 @@ class LocalBackend:
         self._playing_env: WristEnv | None = None
         self._learner: Learner | None = None
 
+    def prepare(self) -> None:
+        """Find out now whether simulator, renderer, assets and initial weights are there.
+
+        Raises:
+            ValueError: something is missing; says what and how to mend it.
+        """
+        self._env  # noqa: B018  built here
+        if self._config.encoder.uses_image and self._config.encoder.backbone != "random":
+            Learner(self._config, self.action_dim, torch.device("cpu"))
+
     @property
     def action_dim(self) -> int:
         """Size of the action."""

@@ -70,10 +70,10 @@ class RunDirectory:
     def __init__(self, path: Path, config: RunConfig) -> None:
         self.path = path
         self.config = config
-        path.mkdir(parents=True, exist_ok=True)
         self._lock = FileLock(path / ".lock")
 
     def __enter__(self) -> "RunDirectory":
+        self.path.mkdir(parents=True, exist_ok=True)
         try:
             self._lock.acquire(timeout=0)
         except Timeout:

@@ -50,9 +50,10 @@ def _execute(path: Path, config: RunConfig, artifacts: Path, *, as_json: bool) -
     from slotfilm_dist.runs import RunDirectory
 
     progress, stop = Progress(), StopFlag()
+    backend = LocalBackend(config)
+    backend.prepare()
     with stop.listening(), RunDirectory(path, config) as run:
         progress.say(f"slotfilm  {config.variant} on {config.env.task}, seed {config.seed}: {run.path}")
-        backend = LocalBackend(config)
         try:
             page = Pipeline(run, backend, artifacts, progress, stop).execute()
         except Interrupted as interruption:

@@ -88,6 +88,8 @@ class SceneReader:
 
     def _grasp_cpu(self) -> tuple[bool, bool]:
         """Whether the first object is grasped, and whether any finger touches it."""
+        if not self._has_moved():
+            return False, False
         target = self._entities[0]
         left, right = (finger.entity for finger in self._fingers)
         impulses = {left: np.zeros(3), right: np.zeros(3)}
@@ -123,6 +125,7 @@ class SceneReader:
         ]
         pressing = [torch.linalg.norm(force, dim=-1) >= MIN_CONTACT_FORCE_N for force in forces]
         zeros = torch.zeros(env.num_envs, 3, device=env.device)
+        moved = env.elapsed_steps > 0
         return SceneState(
             qpos=agent.robot.get_qpos(),
             qvel=agent.robot.get_qvel(),
@@ -130,6 +133,10 @@ class SceneReader:
             tcp_twist=torch.cat((agent.tcp.linear_velocity, agent.tcp.angular_velocity), dim=-1),
             object_poses=torch.stack([actor.pose.raw_pose for actor in self._actors], dim=1),
             goal=zeros if self._goal is None else self._goal.pose.p,
-            grasped=agent.is_grasping(target, max_angle=MAX_GRASP_ANGLE_DEG),
-            contact=pressing[0] | pressing[1],
+            grasped=agent.is_grasping(target, max_angle=MAX_GRASP_ANGLE_DEG) & moved,
+            contact=(pressing[0] | pressing[1]) & moved,
         )
+
+    def _has_moved(self) -> bool:
+        """Whether a step was simulated since the reset; until then PhysX still holds the last episode's contacts."""
+        return int(self._env.elapsed_steps[0]) > 0

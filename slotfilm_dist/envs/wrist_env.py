@@ -64,6 +64,8 @@ class WristEnv:
             if "supported modes" not in str(error):
                 raise
             raise ValueError(f"env.control_mode = {config.env.control_mode!r}: {error}") from None
+        except RuntimeError as error:
+            raise ValueError(_cannot_build(config, str(error), camera=camera)) from error
         self.action_dim = int(self._env.single_action_space.shape[0])
         self.reward_term_names: tuple[str, ...] = OWN_TERMS if own else ("reward",)
         self._camera = WristCamera(self._env, config.env) if camera else None  # imported above, only where needed
@@ -184,6 +186,18 @@ class WristEnv:
                 return scene.goal - position
             case _:
                 raise ValueError(f"obs.state_fields: {name!r} is not known to the simulator")
+
+
+def _cannot_build(config: RunConfig, reason: str, *, camera: bool) -> str:
+    """What a user can do about a simulator that does not start."""
+    if config.env.sim_backend == "gpu":
+        return f"env.sim_backend = 'gpu': {reason}; use env.sim_backend = 'cpu', or see `slotfilm doctor`"
+    if camera:
+        return (
+            f"env.render_backend = {config.env.render_backend!r}: the simulator cannot render ({reason}); "
+            "`slotfilm doctor` says what is missing, `bash ops/setup_vulkan.sh` installs a software driver"
+        )
+    return f"env.task = {config.env.task!r}: the simulator does not start ({reason})"
 
 
 def _array(value: Tensor, dtype: Any) -> np.ndarray:

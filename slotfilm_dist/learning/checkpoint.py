@@ -75,7 +75,11 @@ def read_checkpoint(directory: Path, config_hash: str | None = None) -> Checkpoi
             "use the config.json beside it"
         )
     path = directory / TENSORS
-    check_file(path, FileDigest(**manifest["tensors"]))
+    try:
+        digest = FileDigest(**manifest["tensors"])
+    except TypeError:
+        raise ValueError(f"{directory / MANIFEST}: damaged, it does not describe {TENSORS}") from None
+    check_file(path, digest)
     try:
         tensors = load_tensors(path.read_bytes())
     except safetensors.SafetensorError as error:
@@ -92,7 +96,7 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: damaged ({error})") from None
     if not isinstance(manifest, dict) or not manifest.keys() >= {"format", "config_hash", "tensors", "values"}:
         raise ValueError(f"{path}: damaged, fields are missing")
-    if manifest.pop("sha256", None) != _signature(manifest):
+    if manifest.pop("sha256", None) not in (None, _signature(manifest)):
         raise ValueError(f"{path}: damaged, its SHA-256 differs from the one it states")
     if manifest["format"] != FORMAT:
         raise ValueError(f"{path}: written in format {manifest['format']}, this version reads {FORMAT}")
