@@ -223,14 +223,14 @@ class Pipeline:
         self._progress.begin("evaluate", f"{len(seeds)} episodes each: the random policy, the trained agent")
         random = self._play("random", "random", seeds, 0)
         final = self._play("final", "agent", seeds, config.schedule.total_steps)
-        self._write("evaluate", config.schedule.total_steps, 0, self._evaluation_metrics(final))
+        self._write("evaluate", config.schedule.total_steps, None, self._evaluation_metrics(final))
         if config.encoder.uses_image:
             for seed in seeds[: config.evaluation.videos]:
                 self._backend.record(
                     "agent",
                     seed,
                     self._run.path / "videos" / f"agent-{seed}.mp4",
-                    self._run.path / "figures" / f"film-strip-{seed}.png",
+                    self._run.path / "videos" / f"agent-{seed}.png",
                 )
                 self._stop.check()
         low, high = final.success_interval

@@ -47,6 +47,10 @@ class HubActor:
         """Any other method of the hub; none of them waits."""
         return getattr(self._hub, method)(*arguments)
 
+    @ray.method(concurrency_group="control")
+    def process_id(self) -> int:
+        return os.getpid()
+
 
 class ShardActor:
     """A `ShardRole` in a process; started again by Ray when it dies, with its last snapshot."""

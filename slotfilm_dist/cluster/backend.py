@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from slotfilm_dist.backend import Player, TrainReport
-from slotfilm_dist.cluster.clients import HubClient, LearnerClient, ReplayClient, ShardClient
 from slotfilm_dist.cluster.evaluation import EvaluationPool
 from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError, RunFailedError
+from slotfilm_dist.cluster.hub_client import HubClient
 from slotfilm_dist.cluster.messages import AgentSetup, LearnerStatus
 from slotfilm_dist.cluster.placement import plan
+from slotfilm_dist.cluster.replay_client import ReplayClient, ShardClient
 from slotfilm_dist.cluster.reporting import Reporter
+from slotfilm_dist.cluster.role_clients import LearnerClient
 from slotfilm_dist.cluster.session import Session
 from slotfilm_dist.cluster.system import ShardWatch
 from slotfilm_dist.cluster.workforce import Workforce
@@ -205,6 +207,18 @@ class RayBackend:
             self._hub.kill()
             self._hub = None
         self._session.close()
+
+    def want_workers(self, num_workers: int) -> None:
+        """Ask for another number of workers; the caretaker starts or stops them."""
+        self._counts.want_workers(num_workers)
+
+    def process_ids(self) -> dict[str, int]:
+        """Of the processes that live now, by the role's name."""
+        ids = {f"shard {shard.index}": shard.process_id() for shard in self._shards}
+        if self._learner is not None:
+            ids["learner"] = self._learner.process_id()
+        ids["hub"] = self._counts.process_id()
+        return ids | self._workers.process_ids()
 
     @property
     def _workers(self) -> Workforce:

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from slotfilm_dist.backend import Player
-from slotfilm_dist.cluster.clients import PlayerClient
 from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError, RunFailedError
 from slotfilm_dist.cluster.messages import AgentSetup
+from slotfilm_dist.cluster.role_clients import PlayerClient
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.messages import EpisodeSummary, WeightSnapshot
 

@@ -18,7 +18,7 @@ class RoleLostError(Exception):
         super().__init__(f"{name} is gone: {cause}")
         self.name, self.reason, self.cause = name, reason, cause
 
-    def __reduce__(self):  # noqa: ANN204  a tuple as the pickle protocol wants it
+    def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
         return type(self), (self.name, self.reason, self.cause)
 
 
@@ -35,5 +35,5 @@ class RoleSilentError(Exception):
         super().__init__(f"{name} did not answer within {timeout_s:g} s: {waiting_for}")
         self.name, self.waiting_for, self.timeout_s = name, waiting_for, timeout_s
 
-    def __reduce__(self):  # noqa: ANN204  a tuple as the pickle protocol wants it
+    def __reduce__(self) -> tuple[type, tuple[str, str, float]]:
         return type(self), (self.name, self.waiting_for, self.timeout_s)

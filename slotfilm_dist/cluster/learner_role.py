@@ -73,9 +73,11 @@ class LearnerRole:
     """Holds the learner; `start` runs two threads until `stop`.
 
     *Fetcher*: consumes grants of updates and replay; produces chunks of batches, one ready while the next is fetched.
-    Waits for the limiter, for replay to hold `replay.min_steps`, for a shard's answer, and for room. *Updater*: consumes
-    chunks; produces updates and, every `runtime.publish_every`, weights. Waits for a chunk. Both stop within a slice of
-    their waits; updates that were granted and not made are given back.
+    Waits for the limiter, for replay to hold `replay.min_steps`, for a shard's answer, and for room.
+
+    *Updater*: consumes chunks; produces updates and, every `runtime.publish_every`, weights. Waits for a chunk.
+
+    Both stop within a slice of their waits; updates that were granted and not made are given back.
 
     Args:
         config: the run.

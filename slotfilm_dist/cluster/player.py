@@ -75,11 +75,13 @@ class PlayerRole:
             if not isinstance(env, WristEnv):
                 raise ValueError("the scripted expert plays in the simulator only")
             return ExpertPolicy(env)
-        assert setup is not None and snapshot is not None, "begin_training comes first"
+        assert setup is not None, "begin_training comes first"
+        assert snapshot is not None, "begin_training comes first"
         policy = build_policy(self._config, setup, seed, deterministic=True)
         policy.load(snapshot.version, snapshot.arrays)
         return policy
 
     def _prepared(self) -> tuple[VectorEnv, Policy]:
-        assert self._env is not None and self._policy is not None, "prepare comes first"
+        assert self._env is not None, "prepare comes first"
+        assert self._policy is not None, "prepare comes first"
         return self._env, self._policy

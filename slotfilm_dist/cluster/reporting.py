@@ -1,7 +1,7 @@
 """Turns the counters of all roles into the metrics of one report."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from slotfilm_dist.cluster.messages import HubStatus, LearnerStatus, ShardBeat, WorkerBeat
 from slotfilm_dist.config import RunConfig
@@ -15,7 +15,7 @@ class Reporter:
         clock: seconds that only grow.
     """
 
-    def __init__(self, config: RunConfig, clock=time.monotonic) -> None:  # noqa: ANN001  inferred from its default
+    def __init__(self, config: RunConfig, clock: Callable[[], float] = time.monotonic) -> None:
         self._config = config
         self._clock = clock
         self._last: tuple[float, HubStatus, LearnerStatus, float] | None = None

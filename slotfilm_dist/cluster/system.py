@@ -11,13 +11,12 @@
     pipeline: reports once a second, checkpoints, evaluates (PLAYERS, processes of their own)
     caretaker thread: `Supervisor.tick` and `ShardWatch.tick` four times a second
 
-| loop      | consumes        | produces         | waits for                    | unblocked by          | stops          |
-|-----------|-----------------|------------------|------------------------------|-----------------------|----------------|
-| worker    | weights         | blocks           | room in its sender           | a stored block        | between steps  |
-| sender    | blocks          | stored blocks    | limiter; a shard's answer    | updates; shard restart| after a block  |
-| fetcher   | grants, replay  | chunks           | limiter; replay's least size | steps; inserts        | within 0.5 s   |
-| updater   | chunks          | updates, weights | a chunk                      | fetcher               | after an update|
-| caretaker | beats           | restarts         | nothing                      | -                     | within 0.25 s  |
+    loop       consumes         produces          waits for                       stops
+    worker     weights          blocks            room in its sender              between two steps
+    sender     blocks           stored blocks     the limiter; a shard's answer   after its block
+    fetcher    grants, replay   chunks            the limiter; replay's size      within half a second
+    updater    chunks           updates, weights  a chunk                         after its update
+    caretaker  beats            restarts          nothing                         within a quarter second
 
 Every wait has a timeout, is repeated in slices, and its reason is part of the role's beat. A worker that made no
 progress within the limit that its own beat names, or whose process is gone, is killed and replaced: next incarnation,
@@ -29,7 +28,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from slotfilm_dist.cluster.failures import RoleLostError, RunFailedError
 from slotfilm_dist.cluster.messages import ShardBeat, WorkerBeat
@@ -44,6 +43,7 @@ STOP_S = 5.0
 """Time that a worker gets to finish its step and its block under way before it is killed."""
 
 
+@runtime_checkable
 class WorkerHandle(Protocol):
     """A worker's process as the supervisor needs it."""
 
@@ -193,8 +193,8 @@ class Supervisor:
         failures = [at for at in member.failures if now - at <= FAILURE_WINDOW_S] + [now]
         if len(failures) >= MAX_FAILURES:
             raise RunFailedError(
-                f"worker {worker_id} failed {len(failures)} times within {now - failures[0]:.0f} s without collecting a "
-                f"block, last: {cause}; `slotfilm doctor` checks what a worker needs, then go on with --resume"
+                f"worker {worker_id} failed {len(failures)} times within {now - failures[0]:.0f} s without collecting "
+                f"a block, last: {cause}; `slotfilm doctor` checks what a worker needs, then go on with --resume"
             )
         self._start(worker_id, failures)
 

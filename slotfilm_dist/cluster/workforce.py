@@ -5,10 +5,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from slotfilm_dist.cluster.clients import HubClient, ReplayClient, ShardClient, WorkerClient
 from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError, RunFailedError
+from slotfilm_dist.cluster.hub_client import HubClient
 from slotfilm_dist.cluster.messages import AgentSetup, BlockKey
 from slotfilm_dist.cluster.placement import share_for_more
+from slotfilm_dist.cluster.replay_client import ReplayClient, ShardClient
+from slotfilm_dist.cluster.role_clients import WorkerClient
 from slotfilm_dist.cluster.session import Session
 from slotfilm_dist.cluster.system import ShardWatch, Supervisor
 from slotfilm_dist.config import RunConfig
@@ -108,6 +110,10 @@ class Workforce:
         """Set all workers to collect for replay with the trained agent."""
         self._shards, self.watch, self._setup = shards, watch, setup
         self.supervisor.employ_again()
+
+    def process_ids(self) -> dict[str, int]:
+        """Of the workers' processes, by name."""
+        return {f"worker {client.worker_id}": client.process_id() for client in self._clients()}
 
     def stop(self) -> None:
         """Stop all workers for good."""

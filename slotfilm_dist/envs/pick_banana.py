@@ -43,7 +43,8 @@ BOWL_BEARING_RAD = np.pi / 6
 """Largest turn of the bowl's bearing away from straight left or right."""
 GOAL_OFFSET_M = 0.10
 """Horizontal distance of the target from the bowl's centre: beside the bowl, on the side of the table's middle."""
-GOAL_HEIGHT_M = (0.10, 0.15)
+GOAL_HEIGHT_M = (0.04, 0.12)
+"""Low enough that the bowl is pushed on the way, as in the paper's Figure 8 (c)."""
 FIXED_GOAL_M = (0.0, 0.0, 0.15)
 MESH_CACHE = Path.home() / ".cache" / "slotfilm" / "meshes"
 

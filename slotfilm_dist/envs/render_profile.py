@@ -94,7 +94,7 @@ class _View:
     def of(cls, camera: Any) -> "_View":
         half_y = max(camera.cx, camera.width - camera.cx) / camera.fx
         half_z = max(camera.cy, camera.height - camera.cy) / camera.fy
-        return cls(near_m=camera.near, tan_y=half_y * 0.6, tan_z=half_z * (1 + _MARGIN_SHARE))
+        return cls(near_m=camera.near, tan_y=half_y * (1 + _MARGIN_SHARE), tan_z=half_z * (1 + _MARGIN_SHARE))
 
     def misses(self, points: Float[np.ndarray, "bodies points 3"]) -> Bool[np.ndarray, " bodies"]:
         """Whether all points of a body lie beyond one and the same side of the pyramid, so that it cannot be seen."""

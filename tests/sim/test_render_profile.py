@@ -62,14 +62,13 @@ def body(env, link):
 
 
 def test_random_poses_give_the_same_pictures_to_the_last_bit():
-    comparison = compare_profiles(num_poses=16, seed=5)
+    comparison = compare_profiles(num_poses=12, seed=5)
     for difference in (comparison.housing_dropped, comparison.wrist):
         assert difference.max_abs == 0
         assert difference.share_of_pixels == 0
         assert difference.share_of_labels == 0
     assert 0 < comparison.arm_in_view < 1
     assert 0 < comparison.far_floor_in_view < 1
-    assert comparison.wrist_ms < comparison.full_ms
 
 
 @pytest.mark.parametrize("qpos", [DOWN, TO_BASE, TO_HORIZON])

@@ -121,7 +121,9 @@ def test_config_survives_its_file(tmp_path: Path, name: str) -> None:
     assert load_config(tmp_path / "config.json") == config
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", "3", "null", '{"sac": []}', '{"variant": 3}', '{"seeed": 1}', "\x00"])
+@pytest.mark.parametrize(
+    "content", ["", "{", "[]", "3", "null", '{"sac": []}', '{"variant": 3}', '{"seeed": 1}', "\x00"]
+)
 def test_corrupt_file_is_refused_by_its_name(tmp_path: Path, content: str) -> None:
     path = tmp_path / "config.json"
     path.write_text(content)

@@ -20,12 +20,8 @@ SEEING = EncoderConfig(backbone="random")
 TOKENS = (64, 42)
 
 
-def build(
-    encoder: EncoderConfig = STATE_ONLY, *, seed: int = 0, lr: LrConfig | None = None, **sac: Any
-) -> SacLearner:
-    config = RunConfig(
-        encoder=encoder, lr=lr or LrConfig(), sac=SacConfig(**{"hidden": (16,), "batch_size": 8} | sac)
-    )
+def build(encoder: EncoderConfig = STATE_ONLY, *, seed: int = 0, lr: LrConfig | None = None, **sac: Any) -> SacLearner:
+    config = RunConfig(encoder=encoder, lr=lr or LrConfig(), sac=SacConfig(**{"hidden": (16,), "batch_size": 8} | sac))
     made = SlotFusionEncoder(encoder, config.obs, 128, seed=3)
     if not config.sac.end_to_end:
         made.freeze_backbone()

@@ -1,0 +1,118 @@
+"""The command line's refusals: one sentence, exit code 2, nothing written or changed."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from slotfilm_dist.__main__ import COMMANDS, main
+from slotfilm_dist.config import RunConfig, save_config
+from slotfilm_dist.presets import smoke
+from slotfilm_dist.runs import RunDirectory
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    """The sentence on standard error of a command that refuses."""
+    assert main(words) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("slotfilm: ")
+    assert told.err.count("\n") == 1
+    assert "Traceback" not in told.err
+    return told.err
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (("trian",), "did you mean 'train'"),
+        (("train", "quik"), "did you mean 'quick'"),
+        (("train", "--variant", "no_stat"), "did you mean 'no_state'"),
+        (("train", "--env.task", "PickBanana"), "did you mean 'PickBanana-v1'"),
+        (("train", "--sac.gama", "0.9"), "did you mean --sac.gamma"),
+        (("train", "--sac.gamma", "2"), "sac.gamma"),
+        (("train", "--sac.gamma", "high"), "sac.gamma"),
+        (("train", "--sac.gamma"), "sac.gamma"),
+        (("train", "--runtime.mode", "rya"), "runtime.mode"),
+        (("train", "quick", "extra"), "extra"),
+        (("train", "--name", "a/b"), "--name"),
+        (("train", "--resume", "nowhere"), "config.json does not exist"),
+        (("evaluate",), "--policy expert"),
+        (("evaluate", "nowhere"), "config.json does not exist"),
+        (("evaluate", "--policy", "expret"), "expert"),
+        (("evaluate", "--policy", "random", "--episodes", "0"), "--episodes 0"),
+        (("evaluate", "--policy", "random", "--episodes", "many"), "many"),
+        (("report", "nowhere"), "nowhere"),
+        (("report",), "run"),
+        (("cost", "--only", "no_stat"), "did you mean 'no_state'"),
+        (("variants", "--taks"), "--taks"),
+    ],
+)
+def test_mistake_is_refused_in_one_sentence_before_anything_is_written(
+    place: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], part: str
+) -> None:
+    assert part in refusal(capsys, *words)
+    assert list(place.iterdir()) == []
+
+
+def test_existing_run_and_corrupt_config_stay_as_they_are(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (place / "runs" / "mine").mkdir(parents=True)
+    (place / "runs" / "mine" / "config.json").write_text('{"sac": {"gamma"')
+    before = contents(place)
+    assert "exists; choose another --name" in refusal(capsys, "train", "--name", "mine")
+    for command in (("train", "--resume"), ("evaluate",)):
+        assert "config.json is not valid JSON" in refusal(capsys, *command, "runs/mine")
+    assert contents(place) == before
+
+
+def test_resuming_with_another_agent_is_refused(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (place / "run").mkdir()
+    save_config(smoke(), place / "run" / "config.json")
+    before = contents(place)
+    assert "sac.gamma cannot change" in refusal(capsys, "train", "--resume", "run", "--sac.gamma", "0.5")
+    assert contents(place) == before
+
+
+def test_second_driver_of_a_run_is_refused(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config: RunConfig = replace(smoke(), runtime=replace(smoke().runtime, mode="local"))
+    with RunDirectory.create(place / "run", config):
+        before = contents(place)
+        assert "is in use by process" in refusal(capsys, "train", "--resume", "run")
+        assert contents(place) == before
+
+
+@pytest.mark.parametrize("name", list(COMMANDS))
+def test_every_command_has_help(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([name, "--help"])
+    assert stop.value.code == 0
+    assert f"usage: slotfilm {name}" in capsys.readouterr().out
+
+
+def test_help_lists_every_command_and_imports_neither_torch_nor_ray() -> None:
+    script = (
+        "import sys; from slotfilm_dist.__main__ import main; main(['--help']); "
+        "print(sorted({'torch', 'ray', 'mani_skill', 'sapien'} & set(sys.modules)))"
+    )
+    told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert told.splitlines()[-1] == "[]"
+    assert all(f"\n  {name} " in told for name in COMMANDS)
+
+
+def test_fields_are_listed_with_their_defaults(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["train", "smoke", "--fields"])
+    assert stop.value.code in (0, None)
+    assert "--sac.gamma" in capsys.readouterr().out

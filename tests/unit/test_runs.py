@@ -1,0 +1,103 @@
+"""Run directories: names, the lock, what may change on resuming."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from slotfilm_dist.config import RunConfig, load_config
+from slotfilm_dist.messages import EpisodeSummary
+from slotfilm_dist.runs import RunDirectory, new_run_directory
+
+CONFIG = RunConfig()
+
+
+def test_name_is_preset_variant_seed_and_the_first_free_number(tmp_path: Path) -> None:
+    config = replace(CONFIG, seed=3)
+    assert new_run_directory(tmp_path, config, "quick").name == "quick-slotfilm-s3-001"
+    (tmp_path / "quick-slotfilm-s3-001").mkdir()
+    assert new_run_directory(tmp_path, config, "quick").name == "quick-slotfilm-s3-002"
+
+
+@pytest.mark.parametrize("name", ["a/b", "../x", ".hidden", "", " ", "a b", "x" * 101, "-x", "a\n"])
+def test_name_that_is_no_file_name_is_refused(tmp_path: Path, name: str) -> None:
+    if not name:
+        assert new_run_directory(tmp_path, CONFIG, "quick", name).name.startswith("quick")
+        return
+    with pytest.raises(ValueError, match="--name"):
+        new_run_directory(tmp_path, CONFIG, "quick", name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_existing_run_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(ValueError, match=r"mine exists; choose another --name, or go on with --resume"):
+        new_run_directory(tmp_path, CONFIG, "quick", "mine")
+
+
+def test_entered_run_holds_config_versions_and_owner(tmp_path: Path) -> None:
+    with RunDirectory.create(tmp_path / "run", CONFIG) as run:
+        assert load_config(run.path / "config.json") == CONFIG
+        versions = json.loads((run.path / "versions.json").read_text())
+        assert {"torch", "python", "cpu", "command"} <= versions.keys()
+        assert run.read_status() == {}
+        run.write_status(phase="train", env_steps=7)
+        assert run.read_status()["env_steps"] == 7
+
+
+def test_run_that_is_made_but_not_entered_leaves_nothing_behind(tmp_path: Path) -> None:
+    RunDirectory.create(tmp_path / "run", CONFIG)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_second_driver_is_refused_and_changes_nothing(tmp_path: Path) -> None:
+    with RunDirectory.create(tmp_path / "run", CONFIG) as run:
+        before = {path.name: path.read_bytes() for path in run.path.iterdir()}
+        changed = replace(CONFIG, schedule=replace(CONFIG.schedule, total_steps=2_000_000))
+        with pytest.raises(ValueError, match=r"is in use by process \d+ on"), RunDirectory.resume(run.path, changed):
+            pass
+        assert {path.name: path.read_bytes() for path in run.path.iterdir()} == before
+    with RunDirectory.resume(tmp_path / "run", changed):
+        assert load_config(tmp_path / "run" / "config.json") == changed
+
+
+def test_resuming_may_change_budgets_but_not_what_was_learned_from(tmp_path: Path) -> None:
+    with RunDirectory.create(tmp_path / "run", CONFIG):
+        pass
+    other = replace(CONFIG, seed=4, sac=replace(CONFIG.sac, gamma=0.9))
+    with pytest.raises(ValueError, match=r"seed, sac\.gamma cannot change in a run that has begun"):
+        RunDirectory.resume(tmp_path / "run", other)
+    assert load_config(tmp_path / "run" / "config.json") == CONFIG
+
+
+def test_missing_run_is_refused_and_not_made(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"config\.json does not exist"):
+        RunDirectory.resume(tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_damaged_status_counts_as_none(tmp_path: Path) -> None:
+    with RunDirectory.create(tmp_path / "run", CONFIG) as run:
+        (run.path / "status.json").write_text("[1")
+        assert run.read_status() == {}
+
+
+def test_episodes_are_appended_as_lines(tmp_path: Path) -> None:
+    episode = EpisodeSummary(
+        seed=5,
+        length=400,
+        episode_return=1.5,
+        success_once=True,
+        success_at_end=False,
+        placed_at_end=False,
+        grasped_once=True,
+        reward_terms=(1.0, 0.5),
+    )
+    with RunDirectory.create(tmp_path / "run", CONFIG) as run:
+        run.log_episodes([episode], 400, 3)
+        run.log_episodes([episode, episode], 800, 4)
+        lines = [json.loads(line) for line in (run.path / "episodes.jsonl").read_text().splitlines()]
+    assert [line["env_steps"] for line in lines] == [400, 800, 800]
+    assert lines[0]["seed"] == 5
+    assert lines[2]["policy_version"] == 4
