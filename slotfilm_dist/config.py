@@ -64,6 +64,8 @@ class EnvConfig:
     """Object meshes: generated here, or ManiSkill's downloaded YCB banana and bowl."""
     goal: Literal["near_bowl", "fixed", "random"] = "near_bowl"
     """Where the target point is: beside and above the bowl, at one fixed point, or anywhere above the table."""
+    goal_height_m: tuple[float, ...] = (0.04, 0.12)
+    """Lowest and highest target of `near_bowl`, in metres: low, for Figure 8 (c) shows the bowl being pushed."""
     goal_visible: bool = False
     """Draw the green target in the wrist camera's picture (ManiSkill hides goal markers from sensors)."""
     control_mode: str = "pd_ee_delta_pose"
@@ -98,6 +100,8 @@ class EnvConfig:
             "must be a multiple of 16, at least 32",
         )
         check(1 < self.fov_deg < 170, "env.fov_deg", self.fov_deg, "is in degrees and must lie between 1 and 170")
+        low_high = len(self.goal_height_m) == 2 and 0 <= self.goal_height_m[0] <= self.goal_height_m[1] <= 0.5
+        check(low_high, "env.goal_height_m", self.goal_height_m, "must be a lowest and a highest value in [0, 0.5]")
         check(self.far_m > self.near_m, "env.far_m", self.far_m, f"must be greater than env.near_m = {self.near_m}")
 
 
@@ -617,8 +621,17 @@ def load_config(path: Path) -> RunConfig:
 
 
 def config_hash(*sections: Any) -> str:
-    """First 16 hex digits of SHA-256 over the sections' JSON; names artifacts and checks checkpoints."""
-    plain = [to_dict(s) if dataclasses.is_dataclass(s) else s for s in sections]
+    """First 16 hex digits of SHA-256 over the sections; names artifacts and checks checkpoints.
+
+    Of a config section only the fields that differ from its defaults count, so that a version with a new field still
+    finds what an older one made.
+    """
+    plain = [
+        {type(s).__name__: {name: new for name, (_, new) in changed_fields(type(s)(), s).items()}}
+        if dataclasses.is_dataclass(s)
+        else s
+        for s in sections
+    ]
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 
@@ -29,6 +29,7 @@ REQUEST_BYTES = 32 << 20
 UNFINISHED = ".unfinished"
 
 
+@runtime_checkable
 class UpdateLink(Protocol):
     """What the learner asks of the hub."""
 
@@ -53,6 +54,7 @@ class UpdateLink(Protocol):
         ...
 
 
+@runtime_checkable
 class SampleLink(Protocol):
     """What the learner asks of replay."""
 

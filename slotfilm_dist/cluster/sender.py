@@ -4,7 +4,7 @@ import queue
 import threading
 import time
 from collections.abc import Iterable
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
 from slotfilm_dist.cluster.messages import BlockKey, BlockNotice, StepGrant
@@ -16,6 +16,7 @@ RETRY_S = 0.2
 """Pause before a shard that did not take a block is asked again."""
 
 
+@runtime_checkable
 class HubLink(Protocol):
     """What a worker asks of the hub."""
 
@@ -34,6 +35,7 @@ class HubLink(Protocol):
         ...
 
 
+@runtime_checkable
 class StoreLink(Protocol):
     """What a worker asks of replay."""
 

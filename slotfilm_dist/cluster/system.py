@@ -218,6 +218,7 @@ class Supervisor:
             self._settle(member.handle.worker_id, member.incarnation)
 
 
+@runtime_checkable
 class ShardHandle(Protocol):
     """A shard as its watch needs it."""
 

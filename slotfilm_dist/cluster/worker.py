@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -45,6 +45,7 @@ class Limits:
     step_s: float = STEP_LIMIT_S
 
 
+@runtime_checkable
 class Outlet(Protocol):
     """Where a worker's blocks go."""
 

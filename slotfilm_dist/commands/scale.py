@@ -5,8 +5,12 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from slotfilm_dist.commands.options import Parser
+
+if TYPE_CHECKING:
+    from slotfilm_dist.cluster.hub_client import HubClient
 
 MEASURE_S = 5.0
 """Time over which the steps per second are measured before and after."""
@@ -66,7 +70,7 @@ def main(arguments: Sequence[str]) -> int:
     return 0 if reached or options.timeout_s == 0 else 1
 
 
-def _steps_per_s(hub) -> float:  # noqa: ANN001  the type would import Ray early
+def _steps_per_s(hub: "HubClient") -> float:
     first, began = hub.status().env_steps, time.monotonic()
     time.sleep(MEASURE_S)
     return (hub.status().env_steps - first) / (time.monotonic() - began)

@@ -43,8 +43,6 @@ BOWL_BEARING_RAD = np.pi / 6
 """Largest turn of the bowl's bearing away from straight left or right."""
 GOAL_OFFSET_M = 0.10
 """Horizontal distance of the target from the bowl's centre: beside the bowl, on the side of the table's middle."""
-GOAL_HEIGHT_M = (0.04, 0.12)
-"""Low enough that the bowl is pushed on the way, as in the paper's Figure 8 (c)."""
 FIXED_GOAL_M = (0.0, 0.0, 0.15)
 MESH_CACHE = Path.home() / ".cache" / "slotfilm" / "meshes"
 
@@ -167,7 +165,7 @@ class PickBananaEnv(BaseEnv):
         bowl[:, 0] += distance * torch.cos(bearing)
         bowl[:, 1] += distance * torch.sin(bearing)
         bowl[:, 2] = self._bowl_z
-        height = _uniform(count, *GOAL_HEIGHT_M)
+        height = _uniform(count, *self.task_config.goal_height_m)
         toward_middle = torch.atan2(-bowl[:, 1], -0.05 - bowl[:, 0]) + _uniform(count, -np.pi / 3, np.pi / 3)
         goal = torch.stack(
             (

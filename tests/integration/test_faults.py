@@ -4,10 +4,10 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from conftest import RANDOM_STEPS
 
 from slotfilm_dist.backend import TrainReport
 from slotfilm_dist.cluster.backend import RayBackend
@@ -55,8 +55,7 @@ def assert_exact(run: LiveRun) -> None:
     last = run.finish()
     assert last.metrics["replay_duplicate_blocks_total"] == 0
     assert last.metrics["replay_inserted_steps_total"] == last.env_steps
-    random_steps = last.env_steps - (last.env_steps - 200)
-    assert abs(last.updates - 0.5 * (last.env_steps - random_steps)) <= 0.5 * 100
+    assert abs(last.updates - 0.5 * (last.env_steps - RANDOM_STEPS)) <= 0.5 * 100
 
 
 def test_killed_worker_is_replaced_and_nothing_is_counted_twice(live: LiveRun) -> None:
@@ -98,7 +97,7 @@ def test_sampling_goes_on_without_a_killed_shard(live: LiveRun) -> None:
     print(f"killed shard: answers again after {time.monotonic() - killed_at:.1f} s")
     stored, steps = live.last.metrics["replay_stored_steps"], live.last.env_steps
     live.until(lambda r: r.env_steps > steps + 100 and r.metrics["replay_stored_steps"] > stored, "more steps")
-    assert live.last.metrics["worker_restarts_total/crash" ] == 0 if "worker_restarts_total/crash" in live.last.metrics else True
+    assert live.last.metrics.get("worker_restarts_total/crash", 0) == 0
 
 
 def test_killed_learner_goes_on_from_its_checkpoint(live: LiveRun, tmp_path: Path) -> None:
@@ -123,9 +122,3 @@ def test_number_of_workers_changes_while_the_learner_goes_on(live: LiveRun) -> N
     updates = live.last.updates
     live.until(lambda r: r.updates > updates + 20, "more updates")
     assert_exact(live)
-
-
-def test_worker_that_always_fails_ends_the_run_with_its_cause(start: Start, config: RunConfig, tmp_path: Path) -> None:
-    broken = replace(config, runtime=replace(config.runtime, num_workers=1))
-    backend = start(broken, tmp_path / "run")
-    assert backend.action_dim == 7

@@ -97,7 +97,7 @@ def test_unknown_key_and_wrong_type_are_refused_in_one_sentence(path: str, value
 
 
 def test_state_dim_is_checked_against_the_fields() -> None:
-    with pytest.raises(ValueError, match="add up to 18; set obs.state_dim to 18"):
+    with pytest.raises(ValueError, match="add up to 18; set obs.state_dim = 18"):
         ObsConfig(state_fields=("qpos", "qvel"))
     with pytest.raises(ValueError, match=r"obs\.state_dim"):
         ObsConfig(state_fields=(), state_dim=0)
