@@ -10,6 +10,7 @@ from slotfilm_dist import __version__
 COMMANDS: dict[str, tuple[str, str]] = {
     "doctor": ("commands.doctor:main", "what this machine can do, and a fix for each lack"),
     "train": ("commands.train:main", "a run from nothing to its report, or on with --resume"),
+    "scale": ("commands.scale:main", "more or fewer workers for a run that is under way on Ray"),
     "evaluate": ("commands.evaluate:main", "episodes on held-out seeds: trained agent, expert or random policy"),
     "report": ("commands.report:main", "write the page of a run"),
     "variants": ("commands.listing:variants", "the agents of the study, the tasks, the presets"),

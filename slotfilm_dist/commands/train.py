@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from slotfilm_dist.commands.options import Parser, add_config_options, build_config, change_fields
 from slotfilm_dist.config import RunConfig, load_config
@@ -44,7 +45,7 @@ def _resumed_config(path: Path, fields: Sequence[str]) -> RunConfig:
 
 
 def _execute(path: Path, config: RunConfig, artifacts: Path, *, as_json: bool) -> int:
-    from slotfilm_dist.local import LocalBackend
+    from slotfilm_dist.cluster.failures import RunFailedError
     from slotfilm_dist.pipeline import Interrupted, Pipeline, StopFlag
     from slotfilm_dist.progress import Progress
     from slotfilm_dist.runs import RunDirectory
@@ -67,6 +68,17 @@ def _execute(path: Path, config: RunConfig, artifacts: Path, *, as_json: bool) -
         json.dump({"run": str(path), "report": str(page), **_result(path)}, sys.stdout)
         print()
     return 0
+
+
+def _backend(path: Path, config: RunConfig) -> "Backend":
+    """Where the roles live; each is imported only where it is used."""
+    if config.runtime.mode == "ray":
+        from slotfilm_dist.cluster.backend import RayBackend
+
+        return RayBackend(config, path)
+    from slotfilm_dist.local import LocalBackend
+
+    return LocalBackend(config)
 
 
 def _result(path: Path) -> dict[str, object]:

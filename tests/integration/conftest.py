@@ -1,6 +1,5 @@
 """A Ray cluster for the tests of this folder, and runs on the toy environment that take seconds."""
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -75,12 +74,3 @@ def start(session: Session) -> Iterator[Callable[..., RayBackend]]:
     yield make
     for backend in started:
         backend.close()
-
-
-def wait_until(holds: Callable[[], bool], what: str, timeout_s: float = 90.0) -> float:
-    """Wait for a condition; gives the time it took."""
-    began = time.monotonic()
-    while not holds():
-        assert time.monotonic() - began < timeout_s, f"{what} did not happen within {timeout_s} s"
-        time.sleep(0.02)
-    return time.monotonic() - began

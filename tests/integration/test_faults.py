@@ -7,11 +7,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from conftest import RANDOM_STEPS
-
 from slotfilm_dist.backend import TrainReport
 from slotfilm_dist.cluster.backend import RayBackend
 from slotfilm_dist.config import RunConfig
+from slotfilm_dist.replay.dataset import open_dataset
 
 Start = Callable[..., RayBackend]
 MakeDataset = Callable[[RunConfig], Path]
@@ -24,6 +23,7 @@ class LiveRun:
         self.backend = backend
         self.stop = False
         backend.begin_training(dataset, None, None)
+        self.random_steps = open_dataset(dataset, dataset.name).num_steps
         self._reports: Iterator[TrainReport] = backend.train(lambda: self.stop)
         self.last = next(self._reports)
 
@@ -55,7 +55,7 @@ def assert_exact(run: LiveRun) -> None:
     last = run.finish()
     assert last.metrics["replay_duplicate_blocks_total"] == 0
     assert last.metrics["replay_inserted_steps_total"] == last.env_steps
-    assert abs(last.updates - 0.5 * (last.env_steps - RANDOM_STEPS)) <= 0.5 * 100
+    assert abs(last.updates - 0.5 * (last.env_steps - run.random_steps)) <= 0.5 * 100
 
 
 def test_killed_worker_is_replaced_and_nothing_is_counted_twice(live: LiveRun) -> None:
