@@ -218,14 +218,18 @@ Fusion = Literal["film_tanh", "film_clamp", "concat_proj", "concat_late", "none"
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class EncoderConfig:
-    """The fusion encoder (Sections 4.1 and 4.2)."""
+    """The fusion encoder (Sections 4.1 and 4.2), or a baseline's convolutions in its place (Section 5.1)."""
 
+    kind: Literal["slots", "cnn", "drq", "drqv2"] = "slots"
+    """The proposed slots, or a convolutional network that learns from pixels: plain, DrQ-v1's or DrQ-v2's."""
+    conv_channels: int = 32
+    """Filters of each of the four convolutions of a pixel encoder."""
     backbone: Literal["imagenet", "path", "random"] = "imagenet"
     """Initial ResNet-18 weights: torchvision's ImageNet download, a file, or random. Never falls back silently."""
     backbone_path: str = ""
     """ResNet-18 weights for `backbone = path`: .safetensors, or a torch state dict (loaded with weights_only)."""
     feature_dim: int = 42
-    """Channels D of tokens, slots and FiLM."""
+    """Channels D of tokens, slots and FiLM; what a pixel encoder's convolutions are projected to."""
     num_heads: int = 3
     """Cross-attention heads; must divide `feature_dim`."""
     num_slots: int = 2
@@ -246,9 +250,15 @@ class EncoderConfig:
     """Visibility from the pooled slots, one logit per object; or one logit per slot, matched like the positions."""
 
     def __post_init__(self) -> None:
-        _positive("encoder", self, "feature_dim", "num_heads", "num_slots", "head_hidden")
+        _positive("encoder", self, "conv_channels", "feature_dim", "num_heads", "num_slots", "head_hidden")
         check(
-            self.feature_dim % self.num_heads == 0,
+            not self.learns_from_pixels or (self.fusion in ("none", "concat_late") and not self.goal),
+            "encoder.fusion",
+            self.fusion,
+            f"encoder.kind = {self.kind!r} takes 'none' or, with the state, 'concat_late', and no encoder.goal",
+        )
+        check(
+            self.feature_dim % self.num_heads == 0 or self.learns_from_pixels,
             "encoder.num_heads",
             self.num_heads,
             f"must divide encoder.feature_dim = {self.feature_dim}",
@@ -265,6 +275,11 @@ class EncoderConfig:
             self.backbone_path,
             "encoder.backbone = 'path' needs a file",
         )
+
+    @property
+    def learns_from_pixels(self) -> bool:
+        """Whether it is a baseline's convolutional network, which keeps pictures and has no pre-training."""
+        return self.kind != "slots"
 
     @property
     def uses_image(self) -> bool:
@@ -365,6 +380,10 @@ class SacConfig:
     """Also train the UV and visibility heads in RL (the critic's loss gives them no gradient)."""
     end_to_end: bool = False
     """Train backbone and projection through the critic's loss and keep images in replay (Section 7.4)."""
+    augment_views: int = 0
+    """Randomly shifted views of each picture that the critics average over (DrQ's K = M); 0 shifts nothing."""
+    augment_shift_px: int = 4
+    """Largest random shift of a view in pixels, each way."""
 
     def __post_init__(self) -> None:
         check(0 <= self.gamma < 1, "sac.gamma", self.gamma, "must lie in [0, 1)")
@@ -376,12 +395,50 @@ class SacConfig:
             "needs at least one layer, each wider than 0",
         )
         _positive("sac", self, "batch_size", "reward_scale", "temperature")
-        _not_negative("sac", self, "grad_clip")
+        _not_negative("sac", self, "grad_clip", "augment_views")
+        _positive("sac", self, "augment_shift_px")
         check(
             self.log_std_min < self.log_std_max,
             "sac.log_std_min",
             self.log_std_min,
             f"must be below sac.log_std_max = {self.log_std_max}",
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DdpgConfig:
+    """DrQ-v2's deterministic policy gradient; discount, batch, reward scale and bootstrap are those of `sac`."""
+
+    num_steps: int = 3
+    """Rewards that a critic's target adds up before it bootstraps."""
+    tau: float = 0.01
+    """Polyak rate of the target critics."""
+    lr: float = 1e-4
+    """Adam learning rate of encoder, critics and actor."""
+    hidden: tuple[int, ...] = (1024, 1024)
+    """Hidden layers of actor and critics."""
+    first_std: float = 1.0
+    """Deviation of the exploration noise at the first step."""
+    last_std: float = 0.1
+    """Deviation of the exploration noise from `std_steps` on."""
+    std_steps: int = 500_000
+    """Environment steps over which the deviation falls linearly."""
+    noise_clip: float = 0.3
+    """Largest noise on an action in the losses; acting does not clip."""
+    shift_px: int = 4
+    """Largest random shift of a picture in pixels, each way."""
+    shift: Literal["bilinear", "whole"] = "bilinear"
+    """Shifts by any distance with bilinear interpolation, as published, or by whole pixels, as the released code does."""
+
+    def __post_init__(self) -> None:
+        _positive("ddpg", self, "num_steps", "lr", "first_std", "last_std", "std_steps", "noise_clip", "shift_px")
+        check(self.num_steps <= 255, "ddpg.num_steps", self.num_steps, "must be 255 or less")
+        check(0 < self.tau <= 1, "ddpg.tau", self.tau, "must lie in (0, 1]")
+        check(
+            len(self.hidden) > 0 and all(h > 0 for h in self.hidden),
+            "ddpg.hidden",
+            self.hidden,
+            "needs at least one layer, each wider than 0",
         )
 
 
@@ -518,8 +575,12 @@ class RunConfig:
     """Encoder."""
     pretrain: PretrainConfig = field(default_factory=PretrainConfig)
     """Pre-training."""
+    algorithm: Literal["sac", "ddpg"] = "sac"
+    """Soft Actor-Critic, or DrQ-v2's deterministic policy gradient (Appendix A.5)."""
     sac: SacConfig = field(default_factory=SacConfig)
     """Reinforcement learning."""
+    ddpg: DdpgConfig = field(default_factory=DdpgConfig)
+    """What `algorithm = ddpg` does differently."""
     lr: LrConfig = field(default_factory=LrConfig)
     """Learning rates."""
     replay: ReplayConfig = field(default_factory=ReplayConfig)
@@ -548,6 +609,39 @@ class RunConfig:
             "pre-training matches every object to a slot of its own and needs at least "
             f"obs.num_objects = {self.obs.num_objects}",
         )
+        self._check_pixel_encoder()
+
+    def _check_pixel_encoder(self) -> None:
+        """A baseline's encoder, its augmentation, its algorithm and the lack of pre-training belong together."""
+        encoder = self.encoder
+        check(
+            not encoder.learns_from_pixels or self.pretrain.steps == 0,
+            "pretrain.steps",
+            self.pretrain.steps,
+            f"encoder.kind = {encoder.kind!r} is not pre-trained; set it to 0",
+        )
+        check(
+            encoder.kind in ("cnn", "drq") or self.sac.augment_views == 0,
+            "sac.augment_views",
+            self.sac.augment_views,
+            "shifts pictures that a convolutional SAC encoder sees; it needs encoder.kind = 'cnn' or 'drq'",
+        )
+        check(
+            (self.algorithm == "ddpg") == (encoder.kind == "drqv2"),
+            "algorithm",
+            self.algorithm,
+            f"'ddpg' and encoder.kind = 'drqv2' go together, here it is {encoder.kind!r}; use --variant drqv2",
+        )
+
+    @property
+    def n_step(self) -> int:
+        """Rewards that a sampled transition adds up: 1, but for the algorithm with n-step returns."""
+        return self.ddpg.num_steps if self.algorithm == "ddpg" else 1
+
+    @property
+    def stores_pictures(self) -> bool:
+        """Whether replay keeps pictures, because what sees them is still learning."""
+        return self.encoder.uses_image and (self.encoder.learns_from_pixels or self.sac.end_to_end)
 
 
 ConfigT = TypeVar("ConfigT")

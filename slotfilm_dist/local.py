@@ -156,7 +156,7 @@ class LocalBackend:
         )
         self._limiter.try_insert(data.num_steps)
         self._limiter.start_learning(data.num_steps)
-        self._policy = AgentPolicy(learner.encoder, learner.sac.actor, role_seed(config.seed, Role.ACTIONS))
+        self._policy = AgentPolicy(learner.encoder, learner.rl.actor, role_seed(config.seed, Role.ACTIONS))
         self._loop = RolloutLoop(self._env, self._policy, role_seed(config.seed, Role.EPISODES))
         if values:
             self._limiter.load(values["limiter"])
@@ -253,6 +253,8 @@ class LocalBackend:
                 index=index,
                 num_shards=count,
                 block_steps=config.runtime.block_steps,
+                n_step=config.n_step,
+                gamma=config.sac.gamma,
             )
             for index in range(count)
         ]
@@ -290,7 +292,7 @@ class LocalBackend:
         if player == "expert":
             return ExpertPolicy(env)
         learner = self._trained()
-        return AgentPolicy(learner.encoder, learner.sac.actor, seed, deterministic=True)
+        return AgentPolicy(learner.encoder, learner.rl.actor, seed, deterministic=True)
 
     def _use_threads(self, *, all_cores: bool) -> None:
         """Threads of torch: all cores for the backbone's large products, half of them for the small ones of SAC.

@@ -132,9 +132,13 @@ class SampleBatch:
     goal: Float32[np.ndarray, "batch 3"]
     action: Float32[np.ndarray, "batch action"]
     reward: Float32[np.ndarray, " batch"]
-    """Unscaled reward."""
+    """Unscaled reward; with n-step returns the discounted sum up to the next frame."""
+    discount: Float32[np.ndarray, " batch"]
+    """What the next frame's value counts: gamma to the number of steps that lie between."""
     terminated: Bool[np.ndarray, " batch"]
+    """The task ended in the last of these steps."""
     truncated: Bool[np.ndarray, " batch"]
+    """The clock ran out in the last of these steps."""
     next_visual: Shaped[np.ndarray, "batch *visual"]
     next_proprio: Float32[np.ndarray, "batch proprio"]
     next_goal: Float32[np.ndarray, "batch 3"]

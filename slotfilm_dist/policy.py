@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float32, Shaped
 
 from slotfilm_dist.messages import Observation
+from slotfilm_dist.nets.agent import AgentActor
 from slotfilm_dist.nets.interface import Encoder
-from slotfilm_dist.nets.policy_heads import Actor
 
 
 @runtime_checkable
@@ -63,11 +63,11 @@ class AgentPolicy:
         encoder: with the frozen backbone; its trainable part follows `load`.
         actor: the policy head.
         seed: of the action noise.
-        deterministic: act by tanh(mean), as in evaluation, instead of sampling.
+        deterministic: act by tanh(mean), as in evaluation, instead of exploring.
     """
 
     def __init__(
-        self, encoder: Encoder, actor: Actor, seed: np.random.SeedSequence, *, deterministic: bool = False
+        self, encoder: Encoder, actor: AgentActor, seed: np.random.SeedSequence, *, deterministic: bool = False
     ) -> None:
         self.encoder = encoder
         self.actor = actor
@@ -96,7 +96,7 @@ class AgentPolicy:
         if self.deterministic:
             return self.actor.mode(latent).cpu().numpy()
         noise = torch.randn(len(latent), self.actor.action_dim, generator=self._noise).to(self._device)
-        return self.actor(latent, noise).action.cpu().numpy()
+        return self.actor.explore(latent, noise).cpu().numpy()
 
     def load(self, version: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Take over published weights."""

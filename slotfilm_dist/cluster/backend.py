@@ -15,7 +15,7 @@ from slotfilm_dist.cluster.placement import plan
 from slotfilm_dist.cluster.replay_client import ReplayClient, ShardClient
 from slotfilm_dist.cluster.reporting import Reporter
 from slotfilm_dist.cluster.role_clients import LearnerClient
-from slotfilm_dist.cluster.session import Session
+from slotfilm_dist.cluster.session import Session, read_cluster_file
 from slotfilm_dist.cluster.system import ShardWatch
 from slotfilm_dist.cluster.workforce import Workforce
 from slotfilm_dist.config import RunConfig
@@ -67,10 +67,6 @@ class RayBackend:
         make_env: builds an environment; a function at the top of a module.
         limits: how long workers may go without progress; None for the defaults.
         snapshot_s: seconds between snapshots of replay.
-
-    Raises:
-        ValueError: the cluster lacks what the config asks for.
-        RunFailedError: no worker could be started.
     """
 
     def __init__(
@@ -82,6 +78,8 @@ class RayBackend:
         snapshot_s: float = SNAPSHOT_S,
     ) -> None:
         self._config, self._run, self._make_env = config, run.resolve(), make_env
+        self._limits, self._snapshot_s = limits, snapshot_s
+        self._session: Session | None = None
         self._learner: LearnerClient | None = None
         self._hub: HubClient | None = None
         self._workforce: Workforce | None = None
@@ -89,29 +87,44 @@ class RayBackend:
         self._shards: list[ShardClient] = []
         self._setup: AgentSetup | None = None
         self._learner_restarts = 0
-        self._session = Session()
-        try:
-            self._placement = plan(config, self._session.nodes())
-            namespace = namespace_of(self._run)
-            starts = self._session.write_cluster_file(self._run, namespace)
-            self._hub = HubClient.launch(config, namespace)
-            self._workforce = Workforce(
-                *(config, self._session, self._hub, make_env, limits, self._placement.share_cpus),
-                first_incarnation=starts * INCARNATIONS_PER_START,
-                snapshot_s=snapshot_s,
-            )
-            self.action_dim, self.reward_term_names = self._workforce.describe()
-        except BaseException:
-            self.close()
-            raise
+        self.action_dim = 0
+        self.reward_term_names: tuple[str, ...] = ()
+
+    def prepare(self) -> None:
+        """Start Ray, the hub and the workers, and wait until one of them has its environment; writes nothing.
+
+        Raises:
+            ValueError: the cluster lacks what the config asks for, or initial weights cannot be had.
+            RunFailedError: no worker could build its environment; names why.
+        """
+        config, session = self._config, Session()
+        self._session = session
+        self._placement = plan(config, session.nodes())
+        self._starts = int(read_cluster_file(self._run).get("starts", 0)) + 1
+        self._hub = HubClient.launch(config, namespace_of(self._run))
+        self._workforce = Workforce(
+            *(config, session, self._hub, self._make_env, self._limits, self._placement.share_cpus),
+            first_incarnation=self._starts * INCARNATIONS_PER_START,
+            snapshot_s=self._snapshot_s,
+        )
+        self.action_dim, self.reward_term_names = self._workforce.describe()
+        if config.encoder.uses_image and config.encoder.backbone != "random":
+            self._launch_learner().call("fetch_weights", timeout_s=LONG_S)
+
+    def enter(self) -> None:
+        """Note in the run directory where the run lives, so that `slotfilm scale` finds it."""
+        assert self._session is not None, "prepare comes first"
+        self._session.write_cluster_file(self._run, namespace_of(self._run), self._starts)
 
     def random_blocks(self, num_steps: int, start: int) -> Iterator[TransitionBlock]:
         """Blocks of the random policy from all workers; a continued collection has random streams of its own."""
+        self.enter()
         yield from self._workers.random_blocks(num_steps)
 
     def pretrain(self, dataset: Path, artifact: Path) -> Iterator[dict[str, float]]:
         """Pre-train in the learner's process, continuing what an interrupted pre-training left."""
-        learner = self._launch_learner()
+        self.enter()
+        learner = self._learner or self._launch_learner()
         dataset, artifact = dataset.resolve(), artifact.resolve()
         learner.call("begin_pretraining", dataset, artifact, timeout_s=LONG_S)
         saved_at, done = time.monotonic(), 0
@@ -127,6 +140,7 @@ class RayBackend:
 
     def begin_training(self, dataset: Path, pretrained: Path | None, resume_from: Path | None) -> dict[str, Any]:
         """Build the learner in its process; replay follows in `train`."""
+        self.enter()
         self._sources = dataset.resolve(), pretrained.resolve() if pretrained else None
         self._resumed = resume_from is not None
         learner = self._learner or self._launch_learner()
@@ -139,6 +153,18 @@ class RayBackend:
             self._counts.count_random_steps(random_steps)
         self._setup = self._counts.agent_setup()
         return values
+
+    def load_agent(self, checkpoints: Path) -> int:
+        """Build the agent of a run's newest checkpoint, to play with; gives the environment steps it learned from.
+
+        Raises:
+            ValueError: there is no checkpoint that can be used.
+        """
+        learner = self._learner or self._launch_learner()
+        env_steps = learner.call("load_agent", checkpoints.resolve(), timeout_s=LONG_S)
+        self._workers.stop()
+        self._setup = self._counts.agent_setup()
+        return env_steps
 
     def train(self, should_stop: Callable[[], bool]) -> Iterator[TrainReport]:
         """Train until the schedule's end, or until `should_stop`, reporting once a second."""
@@ -206,7 +232,9 @@ class RayBackend:
             _attempt(self._hub.close)
             self._hub.kill()
             self._hub = None
-        self._session.close()
+        if self._session is not None:
+            self._session.close()
+            self._session = None
 
     def want_workers(self, num_workers: int) -> None:
         """Ask for another number of workers; the caretaker starts or stops them."""

@@ -89,9 +89,11 @@ class Hub:
         )
 
     def _note_granted(self, notice: BlockNotice) -> bool:
-        """Remember a grant; a worker that was lost while it waited gets none."""
+        """Remember a grant; a worker that was lost, or too late, while it waited gets none."""
         with self._lock:
-            if notice.key.incarnation > self._gone.get(notice.key.worker_id, -1):
+            alive = notice.key.incarnation > self._gone.get(notice.key.worker_id, -1)
+            # Others may have brought the run's last steps while this worker waited.
+            if alive and self._limiter.env_steps - notice.num_steps < self._total_steps:
                 self._pending[notice.key] = notice
                 return True
         self._limiter.refund_insert(notice.num_steps)

@@ -102,6 +102,24 @@ class LearnerRole:
         self._version_offset = 0
         self._granted = self._made = 0
 
+    def fetch_weights(self) -> None:
+        """Find out whether the backbone's initial weights can be had; raises ``ValueError`` if not."""
+        Learner(self._config, self._action_dim, torch.device("cpu"))
+
+    def load_agent(self, checkpoints: Path) -> int:
+        """Build the agent of a run's newest checkpoint and publish it; gives the steps it learned from.
+
+        Raises:
+            ValueError: there is no checkpoint that can be used.
+        """
+        found = CheckpointStore(checkpoints, self._config.checkpoint.keep).read_last(learning_hash(self._config))
+        if found is None:
+            raise ValueError(f"{checkpoints} holds no checkpoint; the run has not trained yet")
+        learner = self._learner = Learner(self._config, self._action_dim, self._device, fetch_weights=False)
+        learner.load_checkpoint(found[0])
+        self._introduce()
+        return int(found[0].values["limiter"]["env_steps"])
+
     def begin_pretraining(self, dataset: Path, artifact: Path) -> None:
         """Get ready to pre-train on a dataset, or to go on where an interrupted pre-training stopped."""
         learner = self._learner = Learner(self._config, self._action_dim, self._device)
@@ -150,12 +168,17 @@ class LearnerRole:
         learner.begin_rl(data)
         if found is not None:
             learner.load_checkpoint(found[0])
+        self._introduce()
+        return (dict(found[0].values) if found is not None else {}), learner.schema(), data.num_steps
+
+    def _introduce(self) -> None:
+        """Give policies the encoder and the first weights."""
+        learner = self.learner
         arrays = {k: v.detach().cpu().numpy() for k, v in learner.encoder.state_dict().items()}
         self._hub.set_up_agents(AgentSetup(action_dim=self._action_dim, encoder=arrays))
         # A learner that goes back to a checkpoint must not publish a version that its workers have already seen.
         self._version_offset = max(0, self._hub.newest_version() + 1 - learner.updates)
         self._hub.publish(self._snapshot())
-        return (dict(found[0].values) if found is not None else {}), learner.schema(), data.num_steps
 
     def connect(self, store: SampleLink) -> None:
         """Take replay, which is built to this agent's schema."""

@@ -10,7 +10,6 @@ from slotfilm_dist.contracts import VectorEnv
 from slotfilm_dist.evaluation.rollouts import Recorder, play_episodes
 from slotfilm_dist.evaluation.video import write_film_strip, write_video
 from slotfilm_dist.messages import EpisodeSummary, WeightSnapshot
-from slotfilm_dist.nets.encoder import SlotFusionEncoder
 from slotfilm_dist.policy import AgentPolicy, Policy, RandomPolicy
 from slotfilm_dist.seeds import Role, role_seed
 
@@ -56,7 +55,7 @@ class PlayerRole:
         """One episode, with its video and film strip."""
         env, policy = self._prepared()
         encoder = policy.encoder if isinstance(policy, AgentPolicy) else None
-        recorder = Recorder(encoder if isinstance(encoder, SlotFusionEncoder) else None)
+        recorder = Recorder(encoder)
         summary = next(play_episodes(env, policy, [seed], recorder))
         write_video(recorder.frames, video)
         write_film_strip(recorder.frames, film_strip)

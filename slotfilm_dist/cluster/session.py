@@ -15,10 +15,13 @@ from typing import Any
 import ray
 
 from slotfilm_dist.atomic import write_atomic
+from slotfilm_dist.cluster.failures import RunFailedError
 from slotfilm_dist.machine import usable_cores, usable_memory_bytes
 
 STORE_BYTES = 1 << 30
 """Object store of a private cluster: only blocks, batches and weights under way live there."""
+START_ATTEMPTS = 3
+"""Ray gives its own processes half a minute to start, which a loaded machine may miss."""
 CLUSTER_FILE = "cluster.json"
 """In the run directory: how `slotfilm scale` finds the run."""
 
@@ -66,12 +69,10 @@ class Session:
         """Cores that nobody has asked for."""
         return float(ray.available_resources().get("CPU", 0.0))
 
-    def write_cluster_file(self, run: Path, namespace: str) -> int:
-        """Note in the run directory where the run lives; gives how often it has been started, this time included."""
-        starts = int(read_cluster_file(run).get("starts", 0)) + 1
+    def write_cluster_file(self, run: Path, namespace: str, starts: int) -> None:
+        """Note in the run directory where the run lives, and how often it has been started, this time included."""
         values = {"address": self.address, "namespace": namespace, "token_path": self.token_path, "starts": starts}
         write_atomic(run / CLUSTER_FILE, [json.dumps(values, indent=1).encode()])
-        return starts
 
     def close(self) -> None:
         """Leave the cluster, or end the private one."""
@@ -98,6 +99,20 @@ class Session:
             token.write_text(secrets.token_hex(32))
             self._set("RAY_AUTH_TOKEN_PATH", str(token))
             self._environment.setdefault("RAY_AUTH_MODE", None)  # Ray turns it on by itself where a token is there
+        for attempt in range(START_ATTEMPTS):
+            try:
+                self._init(num_cpus)
+                return
+            except Exception as error:  # Ray raises plain Exceptions when a process of its own starts too slowly
+                ray.shutdown()
+                if attempt == START_ATTEMPTS - 1:
+                    self.close()
+                    raise RunFailedError(
+                        f"Ray did not start here in {START_ATTEMPTS} attempts ({str(error).splitlines()[0]}); "
+                        "is the machine overloaded? --runtime.mode local runs without Ray"
+                    ) from error
+
+    def _init(self, num_cpus: int) -> None:
         ray.init(
             num_cpus=num_cpus,
             object_store_memory=min(STORE_BYTES, usable_memory_bytes() // 4),
@@ -106,6 +121,7 @@ class Session:
             logging_level=logging.ERROR,
             _temp_dir=str(self._folder),
             _node_ip_address="127.0.0.1",
+            _system_config={"agent_register_timeout_ms": 100_000},
         )
 
     def _set(self, name: str, value: str) -> None:

@@ -43,6 +43,8 @@ def build_shard(config: RunConfig, schema: ReplaySchema, index: int) -> FencedSh
         index=index,
         num_shards=count,
         block_steps=config.runtime.block_steps,
+        n_step=config.n_step,
+        gamma=config.sac.gamma,
     )
 
 

@@ -16,11 +16,10 @@ from slotfilm_dist.cluster.sender import BlockSender, HubLink, StoreLink
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.contracts import VectorEnv
 from slotfilm_dist.messages import Observation, StepResult, TransitionBlock, WeightSnapshot
-from slotfilm_dist.nets.encoder import SlotFusionEncoder
-from slotfilm_dist.nets.policy_heads import Actor
+from slotfilm_dist.nets.agent import build_actor, build_encoder
 from slotfilm_dist.policy import AgentPolicy, Policy, RandomPolicy
 from slotfilm_dist.rollout import RolloutLoop
-from slotfilm_dist.seeds import Role, role_number, role_seed
+from slotfilm_dist.seeds import Role, role_seed
 
 EnvFactory = Callable[[RunConfig, bool], VectorEnv]
 """Builds the environment of a run, with a camera or without; a function at the top of a module."""
@@ -111,24 +110,12 @@ def build_policy(
     config: RunConfig, setup: AgentSetup, seed: np.random.SeedSequence, *, deterministic: bool = False
 ) -> AgentPolicy:
     """The agent's policy on a CPU, with the learner's own encoder; `load` gives it the newest weights."""
-    encoder = SlotFusionEncoder(
-        config.encoder,
-        config.obs,
-        config.env.image_size,
-        seed=role_number(config.seed, Role.ENCODER),
-        fetch_weights=False,
-    )
+    encoder = build_encoder(config, fetch_weights=False)
     encoder.load_state_dict({name: torch.tensor(value) for name, value in setup.encoder.items()})
     if not config.sac.end_to_end:
         encoder.freeze_backbone()
     encoder.eval()
-    actor = Actor(
-        encoder.latent_dim,
-        setup.action_dim,
-        config.sac.hidden,
-        log_std_range=(config.sac.log_std_min, config.sac.log_std_max),
-    )
-    return AgentPolicy(encoder, actor, seed, deterministic=deterministic)
+    return AgentPolicy(encoder, build_actor(config, encoder, setup.action_dim), seed, deterministic=deterministic)
 
 
 class WorkerLoop:

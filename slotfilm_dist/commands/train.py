@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING
 from slotfilm_dist.commands.options import Parser, add_config_options, build_config, change_fields
 from slotfilm_dist.config import RunConfig, load_config
 
+if TYPE_CHECKING:
+    from slotfilm_dist.backend import Backend
+
 
 def main(arguments: Sequence[str]) -> int:
     """Train; gives the exit code."""
@@ -51,18 +54,21 @@ def _execute(path: Path, config: RunConfig, artifacts: Path, *, as_json: bool) -
     from slotfilm_dist.runs import RunDirectory
 
     progress, stop = Progress(), StopFlag()
-    backend = LocalBackend(config)
-    backend.prepare()
-    with stop.listening(), RunDirectory(path, config) as run:
-        progress.say(f"slotfilm  {config.variant} on {config.env.task}, seed {config.seed}: {run.path}")
-        try:
+    backend = _backend(path, config)
+    try:
+        backend.prepare()
+        with stop.listening(), RunDirectory(path, config) as run:
+            progress.say(f"slotfilm  {config.variant} on {config.env.task}, seed {config.seed}: {run.path}")
             page = Pipeline(run, backend, artifacts, progress, stop).execute()
-        except Interrupted as interruption:
-            progress.say(f"{interruption}; go on with: slotfilm train --resume {run.path}")
-            return interruption.exit_code
-        finally:
-            progress.end()
-            backend.close()
+    except Interrupted as interruption:
+        progress.say(f"{interruption}; go on with: slotfilm train --resume {path}")
+        return interruption.exit_code
+    except RunFailedError as failure:
+        progress.say(f"slotfilm: {failure}")
+        return 1
+    finally:
+        progress.end()
+        backend.close()
     progress.say(f"  report  {page}")
     if as_json:
         json.dump({"run": str(path), "report": str(page), **_result(path)}, sys.stdout)

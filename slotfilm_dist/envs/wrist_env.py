@@ -68,8 +68,8 @@ class WristEnv:
             raise ValueError(_cannot_build(config, str(error), camera=camera)) from error
         self.action_dim = int(self._env.single_action_space.shape[0])
         self.reward_term_names: tuple[str, ...] = OWN_TERMS if own else ("reward",)
-        self._camera = WristCamera(self._env, config.env) if camera else None  # imported above, only where needed
-        self._reader = SceneReader(self._env, self._task.objects, self._task.goal)
+        self._make_camera = (lambda: WristCamera(self._env, config.env)) if camera else (lambda: None)
+        self._attach()
         self._elapsed = np.zeros(num_envs, np.int64)
         self.episode_steps = config.env.max_steps
         """Steps after which an episode is truncated."""
@@ -89,15 +89,25 @@ class WristEnv:
         return self._env.scene_state() if self._task.own_reward else self._reader.read()
 
     def reset(self, seeds: Sequence[int]) -> Observation:
-        """Start an episode in every environment; the same seed gives the same episode."""
+        """Start an episode in every environment; the same seed gives the same episode, bit for bit.
+
+        On the CPU the simulator is built anew for that (half a second), unless nothing has moved in it yet: PhysX keeps
+        an order of contacts that depends on what went before and changes the last digits. The automatic reset within
+        `step` does without: there the same seed gives the same start.
+        """
         if len(seeds) != self.num_envs:
             raise ValueError(f"seeds: got {len(seeds)} for {self.num_envs} environments")
-        self._env.reset(seed=list(seeds) if self.num_envs > 1 else int(seeds[0]))
+        self._env.reset(
+            seed=list(seeds) if self.num_envs > 1 else int(seeds[0]), options={"reconfigure": self._moved}
+        )
+        if self._moved:
+            self._attach()
         self._elapsed[:] = 0
         return self._observe()
 
     def step(self, action: Float32[np.ndarray, "envs action"], next_seeds: Sequence[int]) -> StepResult:
         """Execute one control step of actions in [-1, 1]; an ended episode is followed by the one of its next seed."""
+        self._moved = not self._env.gpu_sim_enabled
         _, reward, terminated, _, info = self._env.step(torch.from_numpy(action))
         self._elapsed += 1
         success = _array(info["success"], bool)
@@ -124,6 +134,12 @@ class WristEnv:
         """Release the simulator."""
         self._env.close()
 
+    def _attach(self) -> None:
+        """Take hold of the simulator's objects after they were built."""
+        self._moved = False
+        self._camera = self._make_camera()
+        self._reader = SceneReader(self._env, self._task.objects, self._task.goal)
+
     def _terms(self, reward: Tensor, info: dict[str, Tensor]) -> Float32[np.ndarray, "envs terms"]:
         if not self._task.own_reward:
             return _array(reward, np.float32)[:, None]
@@ -131,8 +147,6 @@ class WristEnv:
 
     def _restart(self, over: np.ndarray, next_seeds: Sequence[int]) -> Observation:
         indices = np.flatnonzero(over)
-        if len(indices) == self.num_envs:
-            return self.reset(next_seeds)
         self._env.reset(
             seed=[int(next_seeds[i]) for i in indices],
             options={"env_idx": torch.as_tensor(indices, device=self._env.device)},

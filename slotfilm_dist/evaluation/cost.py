@@ -10,8 +10,7 @@ import torch
 from torch import nn
 
 from slotfilm_dist.config import RunConfig
-from slotfilm_dist.nets.encoder import SlotFusionEncoder
-from slotfilm_dist.nets.policy_heads import Actor
+from slotfilm_dist.nets.agent import AgentActor, AgentEncoder, build_actor, build_encoder
 
 _ACTION_DIM = 7
 _WARM_UP_PASSES = 10
@@ -44,12 +43,10 @@ def cost_of(config: RunConfig, device: torch.device | str = "cpu", action_dim: i
     """Count and time one agent, on the device and with the torch threads as they are set."""
     device = torch.device(device)
     generator = torch.Generator().manual_seed(config.seed)
-    encoder = SlotFusionEncoder(
-        config.encoder, config.obs, config.env.image_size, seed=config.seed, fetch_weights=False
-    )
+    encoder = build_encoder(config, fetch_weights=False)
     if not config.sac.end_to_end:
         encoder.freeze_backbone()
-    actor = Actor(encoder.latent_dim, action_dim, config.sac.hidden, generator=generator)
+    actor = build_actor(config, encoder, action_dim, generator)
     encoder.to(device).eval()
     actor.to(device)
     if device.type == "cuda":
@@ -76,7 +73,7 @@ def count_params(module: nn.Module) -> int:
 
 
 @torch.inference_mode()
-def _time_passes(encoder: SlotFusionEncoder, actor: Actor, config: RunConfig, device: torch.device) -> np.ndarray:
+def _time_passes(encoder: AgentEncoder, actor: AgentActor, config: RunConfig, device: torch.device) -> np.ndarray:
     """Milliseconds of each timed pass, after a warm-up."""
     rng = np.random.default_rng(config.seed)
     size = config.env.image_size

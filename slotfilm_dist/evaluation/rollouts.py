@@ -10,6 +10,7 @@ from slotfilm_dist.episodes import EpisodeTracker
 from slotfilm_dist.evaluation.video import RolloutFrame
 from slotfilm_dist.messages import EpisodeSummary, Observation, StepResult
 from slotfilm_dist.nets.encoder import SlotFusionEncoder
+from slotfilm_dist.nets.interface import Encoder
 from slotfilm_dist.policy import Policy
 
 Watch = Callable[[Observation, np.ndarray, StepResult], None]
@@ -45,11 +46,12 @@ class Recorder:
     """Collects the frames of an episode for a video, with what the agent attends to.
 
     Args:
-        encoder: whose attention is drawn; None draws the picture alone.
+        encoder: whose slots' attention is drawn; of one without slots, or of None, the picture alone.
     """
 
-    def __init__(self, encoder: SlotFusionEncoder | None) -> None:
-        self._encoder = encoder if encoder is not None and encoder.perception is not None else None
+    def __init__(self, encoder: Encoder | None) -> None:
+        has_slots = isinstance(encoder, SlotFusionEncoder) and encoder.perception is not None
+        self._encoder = encoder if has_slots else None
         self.frames: list[RolloutFrame] = []
 
     @torch.inference_mode()

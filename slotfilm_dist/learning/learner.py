@@ -24,11 +24,16 @@ import torch
 
 from slotfilm_dist.config import RunConfig, config_hash
 from slotfilm_dist.learning.checkpoint import Checkpoint, plain_tensors
+from slotfilm_dist.learning.ddpg import DdpgLearner
 from slotfilm_dist.learning.frames import PretrainFrames
+from slotfilm_dist.learning.off_policy import OffPolicyLearner
 from slotfilm_dist.learning.pretrain import Pretrainer
 from slotfilm_dist.learning.sac import SacLearner
 from slotfilm_dist.messages import SampleBatch, TransitionBlock, WeightSnapshot
+from slotfilm_dist.nets.agent import AgentEncoder, build_encoder
 from slotfilm_dist.nets.encoder import SlotFusionEncoder
+from slotfilm_dist.nets.interface import Encoder
+from slotfilm_dist.nets.pixel_encoder import PixelEncoder
 from slotfilm_dist.replay.dataset import FrameDataset
 from slotfilm_dist.replay.schema import ReplaySchema
 from slotfilm_dist.seeds import Role, role_number, role_seed
@@ -58,7 +63,7 @@ def data_identity(config: RunConfig) -> dict[str, Any]:
 
 
 class Learner:
-    """Holds encoder and SAC.
+    """Holds the encoder and the RL on it: SAC, or DrQ-v2's own algorithm.
 
     Args:
         config: the run.
@@ -74,21 +79,15 @@ class Learner:
         self.config = config
         self.device = device
         self._action_dim = action_dim
-        self.encoder = SlotFusionEncoder(
-            config.encoder,
-            config.obs,
-            config.env.image_size,
-            seed=role_number(config.seed, Role.ENCODER),
-            fetch_weights=fetch_weights,
-        ).to(device)
+        self.encoder: AgentEncoder = build_encoder(config, fetch_weights=fetch_weights).to(device)
         self._pretrainer: Pretrainer | None = None
-        self._sac: SacLearner | None = None
+        self._rl: OffPolicyLearner | None = None
 
     @property
-    def sac(self) -> SacLearner:
+    def rl(self) -> OffPolicyLearner:
         """The RL half; exists after `begin_rl`."""
-        assert self._sac is not None, "begin_rl comes first"
-        return self._sac
+        assert self._rl is not None, "begin_rl comes first"
+        return self._rl
 
     @property
     def needs_pretraining(self) -> bool:
@@ -103,13 +102,13 @@ class Learner:
     @property
     def updates(self) -> int:
         """Updates done."""
-        return self._sac.updates if self._sac else 0
+        return self._rl.updates if self._rl else 0
 
     def begin_pretraining(self, dataset: FrameDataset) -> None:
         """Get ready to pre-train on the random policy's pictures."""
         frames = PretrainFrames(rgb=dataset.rgb, uv=dataset.uv, visible=dataset.visible, episode=dataset.episode)
         self._pretrainer = Pretrainer(
-            self.encoder,
+            self._slots,
             frames,
             self.config.pretrain,
             seed=role_number(self.config.seed, Role.PRETRAIN),
@@ -160,15 +159,16 @@ class Learner:
     def load_pretrained(self, checkpoint: Checkpoint) -> None:
         """Take over the perception of a finished pre-training; fusion and gate keep their own initial values."""
         prefix = "weights.perception."
-        assert self.encoder.perception is not None, "an agent without a camera has nothing to load"
+        perception = self._slots.perception
+        assert perception is not None, "an agent without a camera has nothing to load"
         saved = {k.removeprefix(prefix): v for k, v in checkpoint.tensors.items() if k.startswith(prefix)}
         try:
-            self.encoder.perception.load_state_dict(saved)
+            perception.load_state_dict(saved)
         except RuntimeError as error:
             raise ValueError(f"the pre-trained encoder does not fit this agent: {error}") from None
 
     def begin_rl(self, dataset: FrameDataset | None) -> None:
-        """Freeze the backbone unless it is trained end to end, take the state's statistics, and build SAC."""
+        """Freeze the backbone unless it is trained end to end, take the state's statistics, and build the RL half."""
         config = self.config
         if not config.sac.end_to_end:
             self.encoder.freeze_backbone()
@@ -181,9 +181,12 @@ class Learner:
                 torch.from_numpy(np.maximum(std, SMALLEST_STD).astype(np.float32)).to(self.device),
             )
         self._pretrainer = None
-        self._sac = SacLearner(
-            config, self.encoder, self._action_dim, role_seed(config.seed, Role.LEARNER), self.device
-        )
+        self._rl = build_rl(config, self.encoder, self._action_dim, self.device)
+
+    @property
+    def _slots(self) -> SlotFusionEncoder:
+        assert isinstance(self.encoder, SlotFusionEncoder), "pixel encoders are not pre-trained"
+        return self.encoder
 
     def schema(self) -> ReplaySchema:
         """How this agent's transitions are stored."""
@@ -202,20 +205,20 @@ class Learner:
         return self.encoder.to_visual(torch.from_numpy(np.array(pictures)).to(self.device)).cpu().numpy()
 
     def update(self, batch: SampleBatch) -> None:
-        """One SAC update."""
-        self.sac.update(batch)
+        """One update of every network."""
+        self.rl.update(batch)
 
     def metrics(self) -> dict[str, float]:
         """The latest measurements of RL."""
-        return self.sac.metrics()
+        return self.rl.metrics()
 
     def snapshot(self) -> WeightSnapshot:
         """What workers need to act now."""
-        return WeightSnapshot(version=self.updates, published_at_s=time.time(), arrays=self.sac.acting_arrays())
+        return WeightSnapshot(version=self.updates, published_at_s=time.time(), arrays=self.rl.acting_arrays())
 
     def checkpoint(self, values: Mapping[str, Any]) -> Checkpoint:
         """Everything that the next update depends on, with the caller's own plain values beside it."""
-        state = self.sac.save()
+        state = self.rl.save()
         own = {"updates": state["updates"], "skipped_updates": state["skipped_updates"]}
         return Checkpoint(tensors=state["tensors"], values=own | dict(values), config_hash=learning_hash(self.config))
 
@@ -225,17 +228,29 @@ class Learner:
         Raises:
             ValueError: it does not fit this agent.
         """
-        if self._sac is None:
+        if self._rl is None:
             self.begin_rl(None)
-        self.sac.load({"tensors": checkpoint.tensors, **checkpoint.values})
+        self.rl.load({"tensors": checkpoint.tensors, **checkpoint.values})
 
 
 def learning_hash(config: RunConfig) -> str:
     """Names what a checkpoint depends on: all but budgets and places, which may change on resuming."""
-    return config_hash(config.variant, config.seed, config.env, config.obs, config.encoder, config.sac)
+    own = (config.ddpg,) if config.algorithm == "ddpg" else ()
+    return config_hash(config.variant, config.seed, config.env, config.obs, config.encoder, config.sac, *own)
 
 
-def replay_schema(config: RunConfig, encoder: SlotFusionEncoder, action_dim: int) -> ReplaySchema:
+def build_rl(
+    config: RunConfig, encoder: AgentEncoder, action_dim: int, device: torch.device
+) -> OffPolicyLearner:
+    """The algorithm that a config asks for, on an encoder that is ready for RL."""
+    seed = role_seed(config.seed, Role.LEARNER)
+    if config.algorithm == "ddpg":
+        assert isinstance(encoder, PixelEncoder), "the config allows DrQ-v2's encoder only"
+        return DdpgLearner(config, encoder, action_dim, seed, device)
+    return SacLearner(config, encoder, action_dim, seed, device)
+
+
+def replay_schema(config: RunConfig, encoder: Encoder, action_dim: int) -> ReplaySchema:
     """How an agent's transitions are stored, given its encoder."""
     size = config.env.image_size
     kind = encoder.visual_kind

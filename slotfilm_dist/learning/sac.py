@@ -1,8 +1,24 @@
-"""Soft Actor-Critic on a fusion encoder: one `update` is one line of Algorithm 1's loop."""
+"""Soft Actor-Critic on an encoder: one `update` is one line of Algorithm 1's loop.
+
+With `sac.augment_views = 2` it is the study's DrQ-v1 (Kostrikov et al. 2020, Algorithm 1 with K = M = 2) on the paper's
+SAC with a value network, of which "all SAC-based methods share identical hyperparameters" (Section 5.1):
+
+published                                          here
+K shifts of s' in the target, each with an action  the target value network's mean over K shifts of s'; its soft value
+of its own, target critics' soft value averaged    stands for the expectation over actions
+M shifts of s in the critics' loss, averaged       the same
+actor and temperature see one shift of s           the same, and so does the value network's loss, which takes the place
+                                                   of the target critics' expectation and is not averaged over shifts
+shifts by whole pixels up to 4, border repeated    the same
+encoder trained by the critics, with their rate    the same (`lr.fusion` of the variant is `lr.critic_value`)
+target critics with an encoder of their own        the value network's target; s' is encoded by the online encoder
+actor with a projection of its own                 one latent for all, see `nets.pixel_encoder`
+batch 512, 1024 x 1024 layers, all rates 1e-3,     Table A1, as for every agent on SAC
+temperature tuned from 0.1, critics' Polyak 0.01
+every 2nd update, actor every 2nd update
+"""
 
 import math
-import warnings
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,22 +28,13 @@ from torch import Tensor
 
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.learning import losses
-from slotfilm_dist.learning.checkpoint import plain_tensors
+from slotfilm_dist.learning.augment import random_shift
+from slotfilm_dist.learning.off_policy import METRICS_EVERY, OffPolicyLearner, gradient_norm
 from slotfilm_dist.messages import SampleBatch
 from slotfilm_dist.nets.interface import Encoder
 from slotfilm_dist.nets.policy_heads import Actor, TwinCritic, ValueNet
 
-METRICS_EVERY = 10
-"""Updates between measurements of the metrics; reading them every time would cost a tenth of an update."""
-MAX_SKIPPED = 10
-"""Non-finite updates in a row after which the learner stops."""
-
-
-class TrainingDivergedError(RuntimeError):
-    """Losses were not finite for `MAX_SKIPPED` updates in a row."""
-
-
-class SacLearner:
+class SacLearner(OffPolicyLearner):
     """Holds encoder, actor, critics and value network and improves them batch by batch.
 
     Args:
@@ -41,15 +48,13 @@ class SacLearner:
     def __init__(
         self, config: RunConfig, encoder: Encoder, action_dim: int, seed: np.random.SeedSequence, device: torch.device
     ) -> None:
-        self.config = config
-        self.device = device
         init_seed, noise_seed = (int(s.generate_state(1)[0]) for s in seed.spawn(2))
+        super().__init__(encoder, noise_seed, device)
+        self.config = config
         generator = torch.Generator().manual_seed(init_seed)
-        self._noise = torch.Generator(device=device).manual_seed(noise_seed)
         sac = config.sac
         norm = sac.critic_norm == "layer"
         latent = encoder.latent_dim
-        self.encoder = encoder.to(device)
         self.actor = Actor(
             latent, action_dim, sac.hidden, log_std_range=(sac.log_std_min, sac.log_std_max), generator=generator
         ).to(device)
@@ -60,10 +65,6 @@ class SacLearner:
         self.target_value.requires_grad_(False)
         self.log_temperature = torch.tensor(math.log(sac.temperature), device=device, requires_grad=True)
         self._build_optimisers()
-        self.updates = 0
-        self.skipped_updates = 0
-        self._skipped_in_a_row = 0
-        self._metrics: dict[str, Tensor] = {}
 
     def _build_optimisers(self) -> None:
         lr = self.config.lr
@@ -97,13 +98,15 @@ class SacLearner:
         with torch.no_grad():
             next_latent = self._encode(batch.next_visual, batch.next_proprio, batch.next_goal)
             mask = losses.bootstrap_mask(terminated, truncated, sac.bootstrap)
-            target = losses.critic_target(reward, mask, self.target_value(next_latent), sac.gamma)
-        q = self.critic(latent, action)
-        critic_loss = losses.critic_loss(q, target)
+            next_value = self.target_value(next_latent).view(-1, len(reward)).mean(dim=0)
+            target = losses.critic_target(reward, mask, next_value, sac.gamma)
+        views = max(1, sac.augment_views)
+        q = self.critic(latent, action.repeat(views, 1))
+        critic_loss = losses.critic_loss(q, target.repeat(views))
         if not self._step_critic(critic_loss):
             return
 
-        seen = latent.detach()
+        seen = latent[: len(action)].detach()
         noise = torch.randn(action.shape, generator=self._noise, device=self.device)
         sample = self.actor(seen, noise)
         temperature = self.log_temperature.detach().exp()
@@ -123,16 +126,8 @@ class SacLearner:
 
     def _step_critic(self, loss: Float[Tensor, ""]) -> bool:
         """Whether the loss was finite and the step taken."""
-        if not torch.isfinite(loss):
-            self.skipped_updates += 1
-            self._skipped_in_a_row += 1
-            if self._skipped_in_a_row >= MAX_SKIPPED:
-                raise TrainingDivergedError(
-                    f"the critic's loss was not finite {MAX_SKIPPED} times in a row at update {self.updates}; "
-                    "lower lr.critic_value or lr.fusion, set sac.critic_norm = layer, or go back to a checkpoint"
-                )
+        if not self._finite(loss, "lower lr.critic_value or lr.fusion, set sac.critic_norm = layer"):
             return False
-        self._skipped_in_a_row = 0
         self._critic_optimiser.zero_grad(set_to_none=True)
         loss.backward()
         clip = self.config.sac.grad_clip
@@ -170,26 +165,17 @@ class SacLearner:
             "learner_target_mean": target.mean(),
             "learner_entropy_nats": -log_prob.detach().mean(),
             "learner_temperature": temperature,
-        } | {name: _gradient_norm(list(parameters)) for name, parameters in norms.items()}
+        } | {name: gradient_norm(parameters) for name, parameters in norms.items()}
 
-    def metrics(self) -> dict[str, float]:
-        """The latest measurements, by the metric catalogue's names."""
-        values = {name: float(value) for name, value in self._metrics.items()}
-        return values | {"learner_updates_total": self.updates, "learner_nonfinite_total": self.skipped_updates}
-
-    def acting_arrays(self) -> dict[str, np.ndarray]:
-        """What a worker needs to act: actor and the encoder's parts that RL changes."""
-        actor = {f"actor.{k}": v.detach().cpu().numpy().copy() for k, v in self.actor.state_dict().items()}
-        return actor | {f"encoder.{k}": v for k, v in self.encoder.acting_state().items()}
-
-    def _encode(self, visual: np.ndarray, proprio: np.ndarray, goal: np.ndarray) -> Float[Tensor, "batch latent"]:
-        return self.encoder(self._tensor(visual), self._tensor(proprio), self._tensor(goal))
-
-    def _tensor(self, array: np.ndarray) -> Tensor:
-        with warnings.catch_warnings():
-            # Arrays from shared memory are read-only, and nothing here writes to them.
-            warnings.filterwarnings("ignore", message=".*not writable.*")
-            return torch.from_numpy(array).to(self.device, non_blocking=True)
+    def _encode(self, visual: np.ndarray, proprio: np.ndarray, goal: np.ndarray) -> Float[Tensor, "seen latent"]:
+        """Latents; with `sac.augment_views`, those of every sample's first shifted view, then of all second ones."""
+        seen, state, goals = (self._tensor(x) for x in (visual, proprio, goal))
+        sac = self.config.sac
+        if sac.augment_views:
+            shifted = [random_shift(seen, sac.augment_shift_px, self._noise) for _ in range(sac.augment_views)]
+            seen = torch.cat(shifted)
+            state, goals = state.repeat(sac.augment_views, 1), goals.repeat(sac.augment_views, 1)
+        return self.encoder(seen, state, goals)
 
     def modules(self) -> dict[str, torch.nn.Module]:
         """Every network by name, for checkpoints."""
@@ -208,75 +194,5 @@ class SacLearner:
             "temperature_optimiser": self._temperature_optimiser,
         }
 
-    def save(self) -> dict[str, Any]:
-        """Everything that the next update depends on, as flat tensors by name and plain counters."""
-        tensors = {f"{n}.{k}": v for n, m in self.modules().items() for k, v in m.state_dict().items()}
-        for name, optimiser in self._optimisers().items():
-            for index, state in optimiser.state_dict()["state"].items():
-                tensors |= {f"{name}.{index}.{key}": value for key, value in state.items()}
-        tensors["log_temperature"] = self.log_temperature
-        tensors["noise_state"] = self._noise.get_state()
-        return {
-            "tensors": plain_tensors(tensors),
-            "updates": self.updates,
-            "skipped_updates": self.skipped_updates,
-        }
-
-    def load(self, state: Mapping[str, Any]) -> None:
-        """Continue from a saved state.
-
-        Raises:
-            ValueError: a tensor is missing, unknown, or of another shape.
-        """
-        tensors: dict[str, Tensor] = dict(state["tensors"])
-        for name, module in self.modules().items():
-            _load_module(module, name, tensors)
-        for name, optimiser in self._optimisers().items():
-            _load_optimiser(optimiser, name, tensors)
-        for name in ("log_temperature", "noise_state"):
-            if name not in tensors:
-                raise ValueError(f"checkpoint: {name} is missing")
-        with torch.no_grad():
-            self.log_temperature.copy_(tensors["log_temperature"])
-        self._noise.set_state(tensors["noise_state"])
-        self.updates = int(state["updates"])
-        self.skipped_updates = int(state["skipped_updates"])
-
-
-def _gradient_norm(parameters: list[torch.nn.Parameter]) -> Float[Tensor, ""]:
-    gradients = [p.grad for p in parameters if p.grad is not None]
-    if not gradients:
-        return torch.zeros(())
-    return torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
-
-
-def _load_module(module: torch.nn.Module, name: str, tensors: Mapping[str, Tensor]) -> None:
-    prefix = name + "."
-    saved = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
-    expected = module.state_dict()
-    for key in expected.keys() | saved.keys():
-        if key not in saved or key not in expected:
-            raise ValueError(
-                f"checkpoint: {prefix}{key} is {'missing' if key not in saved else 'not part of this agent'}"
-            )
-        if saved[key].shape != expected[key].shape:
-            raise ValueError(
-                f"checkpoint: {prefix}{key} has shape {tuple(saved[key].shape)}, "
-                f"this agent needs {tuple(expected[key].shape)}"
-            )
-    module.load_state_dict(saved)
-
-
-def _load_optimiser(optimiser: torch.optim.Optimizer, name: str, tensors: Mapping[str, Tensor]) -> None:
-    state: dict[int, dict[str, Tensor]] = {}
-    for key, value in tensors.items():
-        owner, _, rest = key.partition(".")
-        if owner == name:
-            index, _, field = rest.partition(".")
-            state.setdefault(int(index), {})[field] = value
-    fields = {field for moments in state.values() for field in moments}
-    for index, moments in state.items():
-        if lacking := sorted(fields - moments.keys()):
-            raise ValueError(f"checkpoint: {name}.{index}.{lacking[0]} is missing")
-    current = optimiser.state_dict()
-    optimiser.load_state_dict({"state": state, "param_groups": current["param_groups"]})
+    def _loose_tensors(self) -> dict[str, Tensor]:
+        return {"log_temperature": self.log_temperature}

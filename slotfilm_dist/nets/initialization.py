@@ -26,3 +26,22 @@ def seeded_normal(*shape: int, generator: torch.Generator) -> nn.Parameter:
     """A parameter of standard normal numbers."""
     values: Tensor = torch.empty(shape)
     return nn.Parameter(nn.init.normal_(values, generator=generator))
+
+
+def orthogonal_linear(in_features: int, out_features: int, generator: torch.Generator | None) -> nn.Linear:
+    """A linear layer with orthogonal weights and zero biases."""
+    layer = nn.Linear(in_features, out_features, device="meta").to_empty(device="cpu")
+    nn.init.orthogonal_(layer.weight, generator=generator)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def orthogonal_conv(
+    in_channels: int, out_channels: int, kernel: int, stride: int, generator: torch.Generator | None
+) -> nn.Conv2d:
+    """A convolution in front of a ReLU, without padding: orthogonal weights with gain sqrt(2), zero biases."""
+    layer = nn.Conv2d(in_channels, out_channels, kernel, stride, device="meta").to_empty(device="cpu")
+    nn.init.orthogonal_(layer.weight, math.sqrt(2), generator=generator)
+    assert layer.bias is not None
+    nn.init.zeros_(layer.bias)
+    return layer

@@ -151,6 +151,12 @@ class Actor(nn.Module):
         unsquashed = mean + log_std.exp() * noise
         return PolicySample(torch.tanh(unsquashed), squashed_log_prob(unsquashed, noise, log_std))
 
+    def explore(
+        self, latent: Float[Tensor, "batch latent"], noise: Float[Tensor, "batch action"]
+    ) -> Float[Tensor, "batch action"]:
+        """The action of training's episodes, for standard normal noise."""
+        return self(latent, noise).action
+
     def mode(self, latent: Float[Tensor, "batch latent"]) -> Float[Tensor, "batch action"]:
         """The deterministic action tanh(mean)."""
         return torch.tanh(self.distribution(latent)[0])

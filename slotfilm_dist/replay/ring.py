@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float32, Int64
 
 from slotfilm_dist.config import check
 from slotfilm_dist.messages import SampleBatch, TransitionBlock
@@ -38,11 +38,18 @@ class RowRing:
     Memory: `capacity_steps` steps in blocks of `block_steps` need one row a step, one more a block and one more an
     episode. So many rows are allocated (touched only as they fill). Shorter blocks or episodes take more rows, and then
     the oldest steps go before `capacity_steps` is reached; `num_steps` is exact in any case.
+
+    With `n_step` above 1 a drawn step is joined with those after it: rewards are added up, discounted by `gamma`, and
+    the next frame is the one after the last of them. Fewer are joined where the episode or the block ends.
     """
 
-    def __init__(self, schema: ReplaySchema, capacity_steps: int, block_steps: int = 32) -> None:
+    def __init__(
+        self, schema: ReplaySchema, capacity_steps: int, block_steps: int = 32, *, n_step: int = 1, gamma: float = 1.0
+    ) -> None:
         check(capacity_steps > 0, "capacity_steps", capacity_steps, "must be greater than 0")
         check(block_steps > 0, "block_steps", block_steps, "must be greater than 0")
+        check(n_step > 0, "n_step", n_step, "must be greater than 0")
+        self._n_step, self._gamma = n_step, gamma
         self.schema = schema
         self.capacity_steps = capacity_steps
         spare_rows = capacity_steps / block_steps + capacity_steps / STEPS_PER_EPISODE_END
@@ -114,7 +121,8 @@ class RowRing:
         return self._gather(rows, sizes)
 
     def _gather(self, rows: Int64[np.ndarray, " total"], sizes: Sequence[int]) -> list[SampleBatch]:
-        next_rows = (rows + 1) % self.num_rows
+        reward, discount, last_rows = self._returns(rows)
+        next_rows = (last_rows + 1) % self.num_rows
         ends = np.cumsum(sizes)
         parts = [
             part
@@ -124,7 +132,11 @@ class RowRing:
         frame_rows = np.concatenate(parts) if parts else rows
         frames = {name: self._columns[name].take(frame_rows, axis=0) for name in ("visual", "proprio", "goal")}
         steps = {
-            name: self._columns[name].take(rows, axis=0) for name in ("action", "reward", "terminated", "truncated")
+            "action": self._columns["action"].take(rows, axis=0),
+            "reward": reward,
+            "discount": discount,
+            "terminated": self._columns["terminated"].take(last_rows),
+            "truncated": self._columns["truncated"].take(last_rows),
         }
         batches: list[SampleBatch] = []
         for end, size in zip(ends, sizes, strict=True):
@@ -141,6 +153,23 @@ class RowRing:
                 )
             )
         return batches
+
+    def _returns(
+        self, rows: Int64[np.ndarray, " total"]
+    ) -> tuple[Float32[np.ndarray, " total"], Float32[np.ndarray, " total"], Int64[np.ndarray, " total"]]:
+        """Discounted sums of rewards from each row on, discounts of what follows, and the rows of the last steps."""
+        last_rows = rows
+        reward = self._columns["reward"].take(rows)
+        discount = np.full(len(rows), self._gamma, np.float32)
+        going = np.ones(len(rows), np.bool_)
+        for ahead in range(1, self._n_step):
+            # An ended episode and a block are followed by a row without a step, so no sum reaches beyond either.
+            following = (rows + ahead) % self.num_rows
+            going &= self._columns["is_step"].take(following)
+            reward = np.where(going, reward + discount * self._columns["reward"].take(following), reward)
+            discount = np.where(going, discount * np.float32(self._gamma), discount)
+            last_rows = np.where(going, following, last_rows)
+        return reward, discount, last_rows
 
     def view(self) -> dict[str, Any]:
         """The state without copying: arrays are read-only views that hold only until the next insert."""

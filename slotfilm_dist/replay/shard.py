@@ -47,6 +47,8 @@ class ReplayShard:
         index: of this shard among `num_shards`.
         num_shards: shards that share the workers' blocks, see `ledger.shard_of`.
         block_steps: steps an environment takes per block; sets how many spare rows are allocated.
+        n_step: rewards that a drawn step adds up.
+        gamma: discount within such a sum.
     """
 
     def __init__(
@@ -58,9 +60,11 @@ class ReplayShard:
         index: int = 0,
         num_shards: int = 1,
         block_steps: int = 32,
+        n_step: int = 1,
+        gamma: float = 1.0,
     ) -> None:
         self.schema = schema
-        self._ring = RowRing(schema, capacity_steps, block_steps)
+        self._ring = RowRing(schema, capacity_steps, block_steps, n_step=n_step, gamma=gamma)
         self._ledger = BlockLedger(index, num_shards)
         self._rng = np.random.default_rng(seed)
         self._inserted_steps = 0

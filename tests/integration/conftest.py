@@ -69,6 +69,7 @@ def start(session: Session) -> Iterator[Callable[..., RayBackend]]:
     def make(config: RunConfig, run: Path, **options: object) -> RayBackend:
         run.mkdir(parents=True, exist_ok=True)
         started.append(RayBackend(config, run, make_toy_env, **options))
+        started[-1].prepare()
         return started[-1]
 
     yield make

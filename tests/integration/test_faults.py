@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+
 from slotfilm_dist.backend import TrainReport
 from slotfilm_dist.cluster.backend import RayBackend
 from slotfilm_dist.config import RunConfig

@@ -33,6 +33,7 @@ LEVELS: dict[str, int] = {
     "learning": 2,  # losses and other pure functions; the loops are named below
     "learning.learner": 3,
     "learning.sac": 3,
+    "learning.ddpg": 3,
     "learning.pretrain": 3,
     "episodes": 2,
     "rollout": 3,
@@ -72,7 +73,7 @@ PICKLES = {"pickle", "cPickle", "_pickle", "cloudpickle", "dill", "joblib", "she
 VAGUE_NAMES = {"utils", "util", "helpers", "helper", "common", "misc"}
 MAX_LINES = 350
 MAX_FUNCTION_LINES = 60
-LONGER_FILES = {"config": 700}
+LONGER_FILES = {"config": 800}
 """Files that may be longer than the rest: the config is one flat list of settings with their help."""
 
 

@@ -1,0 +1,174 @@
+"""What the off-policy learners share: state that is saved and loaded, metrics, and a halt when losses stop being finite."""
+
+import abc
+import warnings
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from slotfilm_dist.learning.checkpoint import plain_tensors
+from slotfilm_dist.messages import SampleBatch
+from slotfilm_dist.nets.agent import AgentActor
+from slotfilm_dist.nets.interface import Encoder
+
+METRICS_EVERY = 10
+"""Updates between measurements of the metrics; reading them every time would cost a tenth of an update."""
+MAX_SKIPPED = 10
+"""Non-finite updates in a row after which the learner stops."""
+
+
+class TrainingDivergedError(RuntimeError):
+    """Losses were not finite for `MAX_SKIPPED` updates in a row."""
+
+
+class OffPolicyLearner(abc.ABC):
+    """An encoder and networks on its latent that improve batch by batch.
+
+    Args:
+        encoder: turns observations into latents.
+        noise_seed: of every random number of the updates.
+        device: where to compute.
+    """
+
+    encoder: Encoder
+    actor: AgentActor
+
+    def __init__(self, encoder: Encoder, noise_seed: int, device: torch.device) -> None:
+        assert isinstance(encoder, torch.nn.Module)
+        self.encoder = encoder.to(device)
+        self.device = device
+        self.updates = 0
+        self.skipped_updates = 0
+        self._noise = torch.Generator(device=device).manual_seed(noise_seed)
+        self._skipped_in_a_row = 0
+        self._metrics: dict[str, Tensor] = {}
+
+    @abc.abstractmethod
+    def update(self, batch: SampleBatch) -> None:
+        """One gradient step of every network.
+
+        Raises:
+            TrainingDivergedError: the loss was not finite `MAX_SKIPPED` times in a row.
+        """
+
+    @abc.abstractmethod
+    def modules(self) -> dict[str, torch.nn.Module]:
+        """Every network by name, for checkpoints."""
+
+    @abc.abstractmethod
+    def _optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """Every optimiser by name, for checkpoints."""
+
+    def _loose_tensors(self) -> dict[str, Tensor]:
+        """Learned tensors that belong to no network, for checkpoints."""
+        return {}
+
+    def metrics(self) -> dict[str, float]:
+        """The latest measurements, by the metric catalogue's names."""
+        values = {name: float(value) for name, value in self._metrics.items()}
+        return values | {"learner_updates_total": self.updates, "learner_nonfinite_total": self.skipped_updates}
+
+    def acting_arrays(self) -> dict[str, np.ndarray]:
+        """What a worker needs to act: actor and the encoder's parts that RL changes."""
+        actor = {f"actor.{k}": v.detach().cpu().numpy().copy() for k, v in self.actor.state_dict().items()}
+        return actor | {f"encoder.{k}": v for k, v in self.encoder.acting_state().items()}
+
+    def save(self) -> dict[str, Any]:
+        """Everything that the next update depends on, as flat tensors by name and plain counters."""
+        tensors = {f"{n}.{k}": v for n, m in self.modules().items() for k, v in m.state_dict().items()}
+        for name, optimiser in self._optimisers().items():
+            for index, state in optimiser.state_dict()["state"].items():
+                tensors |= {f"{name}.{index}.{key}": value for key, value in state.items()}
+        tensors |= self._loose_tensors()
+        tensors["noise_state"] = self._noise.get_state()
+        return {
+            "tensors": plain_tensors(tensors),
+            "updates": self.updates,
+            "skipped_updates": self.skipped_updates,
+        }
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state.
+
+        Raises:
+            ValueError: a tensor is missing, unknown, or of another shape.
+        """
+        tensors: dict[str, Tensor] = dict(state["tensors"])
+        for name, module in self.modules().items():
+            _load_module(module, name, tensors)
+        for name, optimiser in self._optimisers().items():
+            _load_optimiser(optimiser, name, tensors)
+        loose = self._loose_tensors()
+        for name in (*loose, "noise_state"):
+            if name not in tensors:
+                raise ValueError(f"checkpoint: {name} is missing")
+        with torch.no_grad():
+            for name, own in loose.items():
+                own.copy_(tensors[name])
+        self._noise.set_state(tensors["noise_state"])
+        self.updates = int(state["updates"])
+        self.skipped_updates = int(state["skipped_updates"])
+
+    def _finite(self, loss: Float[Tensor, ""], advice: str) -> bool:
+        """Whether the critics' loss is finite, so that a step can be taken; counts those that are not."""
+        if torch.isfinite(loss):
+            self._skipped_in_a_row = 0
+            return True
+        self.skipped_updates += 1
+        self._skipped_in_a_row += 1
+        if self._skipped_in_a_row >= MAX_SKIPPED:
+            raise TrainingDivergedError(
+                f"the critic's loss was not finite {MAX_SKIPPED} times in a row at update {self.updates}; "
+                f"{advice}, or go back to a checkpoint"
+            )
+        return False
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        with warnings.catch_warnings():
+            # Arrays from shared memory are read-only, and nothing here writes to them.
+            warnings.filterwarnings("ignore", message=".*not writable.*")
+            return torch.from_numpy(array).to(self.device, non_blocking=True)
+
+
+def gradient_norm(parameters: Iterable[torch.nn.Parameter]) -> Float[Tensor, ""]:
+    """L2 norm of all gradients together; 0 where there is none."""
+    gradients = [p.grad for p in parameters if p.grad is not None]
+    if not gradients:
+        return torch.zeros(())
+    return torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
+
+
+def _load_module(module: torch.nn.Module, name: str, tensors: Mapping[str, Tensor]) -> None:
+    prefix = name + "."
+    saved = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+    expected = module.state_dict()
+    for key in expected.keys() | saved.keys():
+        if key not in saved or key not in expected:
+            raise ValueError(
+                f"checkpoint: {prefix}{key} is {'missing' if key not in saved else 'not part of this agent'}"
+            )
+        if saved[key].shape != expected[key].shape:
+            raise ValueError(
+                f"checkpoint: {prefix}{key} has shape {tuple(saved[key].shape)}, "
+                f"this agent needs {tuple(expected[key].shape)}"
+            )
+    module.load_state_dict(saved)
+
+
+def _load_optimiser(optimiser: torch.optim.Optimizer, name: str, tensors: Mapping[str, Tensor]) -> None:
+    state: dict[int, dict[str, Tensor]] = {}
+    for key, value in tensors.items():
+        owner, _, rest = key.partition(".")
+        if owner == name:
+            index, _, field = rest.partition(".")
+            state.setdefault(int(index), {})[field] = value
+    fields = {field for moments in state.values() for field in moments}
+    for index, moments in state.items():
+        if lacking := sorted(fields - moments.keys()):
+            raise ValueError(f"checkpoint: {name}.{index}.{lacking[0]} is missing")
+    current = optimiser.state_dict()
+    optimiser.load_state_dict({"state": state, "param_groups": current["param_groups"]})
