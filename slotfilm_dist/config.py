@@ -428,7 +428,7 @@ class DdpgConfig:
     shift_px: int = 4
     """Largest random shift of a picture in pixels, each way."""
     shift: Literal["bilinear", "whole"] = "bilinear"
-    """Shifts by any distance with bilinear interpolation, as published, or by whole pixels, as the released code does."""
+    """Shifts by any distance, with bilinear interpolation as published, or by whole pixels as in the released code."""
 
     def __post_init__(self) -> None:
         _positive("ddpg", self, "num_steps", "lr", "first_std", "last_std", "std_steps", "noise_clip", "shift_px")

@@ -23,11 +23,12 @@ from slotfilm_dist.evaluation.rollouts import Recorder, Watch, play_episodes
 from slotfilm_dist.evaluation.video import write_film_strip, write_video
 from slotfilm_dist.learning.checkpoint import CheckpointStore, read_checkpoint, write_checkpoint
 from slotfilm_dist.learning.learner import Learner, dataset_hash, learning_hash
-from slotfilm_dist.machine import usable_cores
+from slotfilm_dist.machine import usable_cores, usable_memory_bytes
 from slotfilm_dist.messages import EpisodeSummary, TransitionBlock
 from slotfilm_dist.policy import AgentPolicy, Policy, RandomPolicy
 from slotfilm_dist.replay.dataset import open_dataset
 from slotfilm_dist.replay.limiter import RateLimiter
+from slotfilm_dist.replay.memory import check_memory
 from slotfilm_dist.replay.shard import ReplayShard
 from slotfilm_dist.replay.sharded import ShardedReplay
 from slotfilm_dist.replay.snapshot import MANIFEST, read_snapshot, write_snapshot
@@ -68,11 +69,12 @@ class LocalBackend:
         self._learner: Learner | None = None
 
     def prepare(self) -> None:
-        """Find out now whether simulator, renderer, assets and initial weights are there.
+        """Find out now whether memory suffices and simulator, renderer, assets and initial weights are there.
 
         Raises:
             ValueError: something is missing; says what and how to mend it.
         """
+        check_memory(self._config, usable_memory_bytes())
         self._env  # noqa: B018  built here
         if self._config.encoder.uses_image and self._config.encoder.backbone != "random":
             Learner(self._config, self.action_dim, torch.device("cpu"))

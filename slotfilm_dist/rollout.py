@@ -71,7 +71,7 @@ class RolloutLoop:
         if over.any():
             final_visual = self._policy.visual(step.final)
             for i in np.flatnonzero(over):
-                lanes[i].add_frame(step.final, final_visual, i)
+                lanes[i].add_frame(step.final, final_visual, int(i))
         ended = self._tracker.add(step, self._next_seeds)
         self._next_seeds = [
             self._draw_seed() if done else seed for done, seed in zip(over, self._next_seeds, strict=True)

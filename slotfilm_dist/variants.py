@@ -3,10 +3,14 @@
 import difflib
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal
 
 from slotfilm_dist.config import PROPRIO_FIELDS, RunConfig, changed_fields
 
 Variant = Callable[[RunConfig], RunConfig]
+
+DRQ_FEATURES = 50
+"""What both DrQ algorithms project their convolutions to."""
 
 
 def slotfilm(base: RunConfig) -> RunConfig:
@@ -42,6 +46,61 @@ def concat_late(base: RunConfig) -> RunConfig:
 def state_only(base: RunConfig) -> RunConfig:
     """The robot's state alone, without a camera (Section 5.1)."""
     return replace(base, encoder=replace(base.encoder, fusion="state_only", goal=False))
+
+
+def cnn(base: RunConfig) -> RunConfig:
+    """A plain convolutional network that learns from the critics, without the state (Section 5.1)."""
+    return _on_pixels(base, "cnn", base.encoder.feature_dim)
+
+
+def drq(base: RunConfig) -> RunConfig:
+    """DrQ-v1's encoder and its averages over two random shifts on the same SAC, without the state (Section 5.1)."""
+    pixels = _on_pixels(base, "drq", DRQ_FEATURES)
+    return replace(pixels, sac=replace(base.sac, augment_views=2))
+
+
+def drqv2(base: RunConfig) -> RunConfig:
+    """DrQ-v2 with its own deterministic algorithm, without the state, for 2000 epochs (Appendix A.5)."""
+    pixels, schedule = _on_pixels(base, "drqv2", DRQ_FEATURES), base.schedule
+    total_steps = max(schedule.total_steps * 2 // 3, schedule.random_steps)
+    return replace(
+        pixels,
+        # The noise falls until 500k of the 800k steps, and over the same share of a shorter run.
+        ddpg=replace(base.ddpg, std_steps=max(1, total_steps * 5 // 8)),
+        sac=replace(base.sac, batch_size=2 * base.sac.batch_size),
+        schedule=replace(schedule, total_steps=total_steps, updates_per_step=schedule.updates_per_step / 2),
+    )
+
+
+def cnn_state(base: RunConfig) -> RunConfig:
+    """`cnn` with the state appended to its latent (beyond the paper)."""
+    return _with_state(cnn(base))
+
+
+def drq_state(base: RunConfig) -> RunConfig:
+    """`drq` with the state appended to its latent (beyond the paper)."""
+    return _with_state(drq(base))
+
+
+def drqv2_state(base: RunConfig) -> RunConfig:
+    """`drqv2` with the state appended to what its trunks make of the picture (beyond the paper)."""
+    return _with_state(drqv2(base))
+
+
+def _on_pixels(base: RunConfig, kind: Literal["cnn", "drq", "drqv2"], feature_dim: int) -> RunConfig:
+    """No pre-training and no slots; the encoder learns from nothing, at the critics' rate of which it is a part."""
+    encoder = replace(base.encoder, kind=kind, feature_dim=feature_dim, backbone="random", fusion="none", goal=False)
+    return replace(
+        base,
+        algorithm="ddpg" if kind == "drqv2" else "sac",
+        encoder=encoder,
+        pretrain=replace(base.pretrain, steps=0),
+        lr=replace(base.lr, fusion=base.lr.critic_value),
+    )
+
+
+def _with_state(pixels: RunConfig) -> RunConfig:
+    return replace(pixels, encoder=replace(pixels.encoder, fusion="concat_late"))
 
 
 def varpi_1(base: RunConfig) -> RunConfig:
@@ -110,7 +169,7 @@ def oracle_state(base: RunConfig) -> RunConfig:
 SECTIONS: dict[str, tuple[Variant, ...]] = {
     "proposed": (slotfilm, slotfilm_goal),
     "fusion": (no_state, film_clamp, concat_proj, concat_late),
-    "baseline": (state_only,),
+    "baseline": (state_only, cnn, drq, drqv2, cnn_state, drq_state, drqv2_state),
     "reward": (varpi_1, varpi_10, no_static, alpha_5, alpha_15, reward_scale_5, reward_scale_15),
     "slots": (slots_4, slots_competitive),
     "training": (end_to_end,),

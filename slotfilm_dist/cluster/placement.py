@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from slotfilm_dist.config import RunConfig
+from slotfilm_dist.replay.memory import check_memory
 
 SHARES = (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.02, 0.01)
 """Cores that a role may ask for. Below 1, roles share cores: a laptop runs everything, only slower."""
@@ -30,8 +31,10 @@ def plan(config: RunConfig, nodes: Sequence[Mapping[str, float]]) -> Placement:
         nodes: resources of every live node.
 
     Raises:
-        ValueError: the cluster has no GPU where one is asked for, or too few cores.
+        ValueError: the cluster has no GPU where one is asked for, too few cores, or too little memory for replay.
     """
+    if memory := sum(node.get("memory", 0.0) for node in nodes):
+        check_memory(config, int(memory))
     num_gpus = sum(node.get("GPU", 0.0) for node in nodes)
     wants_gpu = config.runtime.device == "cuda"
     if wants_gpu and num_gpus < 1:

@@ -121,7 +121,8 @@ class Session:
             logging_level=logging.ERROR,
             _temp_dir=str(self._folder),
             _node_ip_address="127.0.0.1",
-            _system_config={"agent_register_timeout_ms": 100_000},
+            # Roles at the usual priority: at Ray's own 15 anything else on the machine would starve them.
+            _system_config={"agent_register_timeout_ms": 100_000, "worker_niceness": 0},
         )
 
     def _set(self, name: str, value: str) -> None:

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from slotfilm_dist.commands.options import Parser, build_config
+from slotfilm_dist.commands.options import Parser, build_config, parse_with_fields
 from slotfilm_dist.config import load_config
 
 
@@ -19,7 +19,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--seed", type=int, default=10_000_000, help="first seed (default: %(default)s)")
     parser.add_argument("--artifacts", default="artifacts", metavar="DIR", help="data and encoders that runs share")
     parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
-    options, fields = parser.parse_known_args(arguments)
+    options, fields = parse_with_fields(parser, arguments)
     if options.episodes < 1:
         raise ValueError(f"--episodes {options.episodes}: must be 1 or more")
     player = options.policy or ("agent" if options.run else "")

@@ -14,6 +14,7 @@ from slotfilm_dist.config import RunConfig
 from slotfilm_dist.presets import PRESETS, preset_named
 from slotfilm_dist.variants import VARIANTS, apply_variant
 
+TOP_FIELDS = tuple(field.name for field in dataclasses.fields(RunConfig))
 FIELDS_NOTE = "Every field of the config is an option too, as in --sac.temperature 0.2; `--fields` lists them all."
 
 
@@ -22,6 +23,34 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message}; see `{self.prog} --help`")
+
+
+def parse_with_fields(parser: Parser, arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+    """The parser's own options, and the config fields among them: `--section.field` with the values that follow it."""
+    own: list[str] = []
+    fields: list[str] = []
+    target = own
+    for word in arguments:
+        if word.startswith("--"):
+            name = word.split("=")[0]
+            section = name[2:].split(".")[0].replace("-", "_")
+            if name not in parser._option_string_actions and "." not in name and section not in TOP_FIELDS:
+                known = [*parser._option_string_actions, *(f"--{field}" for field in _field_names(RunConfig(), ""))]
+                near = difflib.get_close_matches(name, known, n=1)
+                parser.error(f"unknown option {name}" + (f"; did you mean {near[0]}?" if near else ""))
+            target = own if name in parser._option_string_actions else fields
+        elif word.startswith("-") and not _is_number(word):
+            target = own
+        target.append(word)
+    return parser.parse_args(own), fields
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def add_config_options(parser: argparse.ArgumentParser, preset: str) -> None:
@@ -84,7 +113,8 @@ def _refusal(fields: Sequence[str], shown: str) -> str:
             return f"unknown field --{name}" + (f"; did you mean --{near[0]}?" if near else "; --fields lists them all")
     lines = [line.strip(" |│╭╮╰╯─\n") for line in shown.splitlines()]
     text = " ".join(line for line in lines if line and "--help" not in line)
-    text = re.sub(r"^(Invalid choice|Unrecognized options|Missing value|Value error)\s+", "", text)
+    text = re.sub(r"[-─]{4,}", "", text).strip()
+    text = re.sub(r"^(Invalid choice|Unrecognized options|Missing argument|Value error)\s+", "", text)
     match = re.search(r"Error parsing (\S+): (.*?)(?: Argument helptext:.*)?$", text)
     if match is None:
         return text

@@ -6,7 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from slotfilm_dist.commands.options import Parser, add_config_options, build_config, change_fields
+from slotfilm_dist.commands.options import (
+    Parser,
+    add_config_options,
+    build_config,
+    change_fields,
+    parse_with_fields,
+)
 from slotfilm_dist.config import RunConfig, load_config
 
 if TYPE_CHECKING:
@@ -27,7 +33,7 @@ def main(arguments: Sequence[str]) -> int:
         help="data and encoders that runs share (default: %(default)s)",
     )
     parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
-    options, fields = parser.parse_known_args(arguments)
+    options, fields = parse_with_fields(parser, arguments)
 
     from slotfilm_dist.runs import new_run_directory
 

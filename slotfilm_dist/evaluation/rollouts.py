@@ -50,8 +50,8 @@ class Recorder:
     """
 
     def __init__(self, encoder: Encoder | None) -> None:
-        has_slots = isinstance(encoder, SlotFusionEncoder) and encoder.perception is not None
-        self._encoder = encoder if has_slots else None
+        sees = isinstance(encoder, SlotFusionEncoder) and encoder.perception is not None
+        self._encoder: SlotFusionEncoder | None = encoder if sees else None
         self.frames: list[RolloutFrame] = []
 
     @torch.inference_mode()

@@ -6,7 +6,7 @@ repeating the border where nothing is left: neither padding nor cropping is form
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 
@@ -20,7 +20,9 @@ def random_shift(
         largest_px: DrQ pads by 4.
         generator: source of the shifts, on the pictures' device.
     """
-    shifts = torch.randint(-largest_px, largest_px + 1, (2, len(pictures), 1), generator=generator, device=pictures.device)
+    shifts = torch.randint(
+        -largest_px, largest_px + 1, (2, len(pictures), 1), generator=generator, device=pictures.device
+    )
     rows, columns = (
         (torch.arange(size, device=pictures.device) + shift).clamp(0, size - 1)
         for size, shift in zip(pictures.shape[1:3], shifts, strict=True)
@@ -53,7 +55,5 @@ def random_shift_bilinear(
         (columns.unsqueeze(1).expand(count, height, width), rows.unsqueeze(2).expand(count, height, width)), dim=-1
     )
     channels_first = pictures.permute(0, 3, 1, 2).float()
-    moved: Shaped[Tensor, "..."] = F.grid_sample(
-        channels_first, grid, mode="bilinear", padding_mode="border", align_corners=False
-    )
+    moved = F.grid_sample(channels_first, grid, mode="bilinear", padding_mode="border", align_corners=False)
     return moved.permute(0, 2, 3, 1)

@@ -129,7 +129,9 @@ class DdpgLearner(OffPolicyLearner):
         self._step(self._critic_optimiser, critic_loss)
 
         seen = latent.detach()
-        actor_loss = -self.critic(seen, self.actor(seen, self._draw(action), ddpg.noise_clip), frozen=True).amin(0).mean()
+        actor_loss = (
+            -self.critic(seen, self.actor(seen, self._draw(action), ddpg.noise_clip), frozen=True).amin(0).mean()
+        )
         self._step(self._actor_optimiser, actor_loss)
         losses.polyak(self._targets, self._online, ddpg.tau)
         self.updates += 1

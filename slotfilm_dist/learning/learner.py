@@ -239,9 +239,7 @@ def learning_hash(config: RunConfig) -> str:
     return config_hash(config.variant, config.seed, config.env, config.obs, config.encoder, config.sac, *own)
 
 
-def build_rl(
-    config: RunConfig, encoder: AgentEncoder, action_dim: int, device: torch.device
-) -> OffPolicyLearner:
+def build_rl(config: RunConfig, encoder: AgentEncoder, action_dim: int, device: torch.device) -> OffPolicyLearner:
     """The algorithm that a config asks for, on an encoder that is ready for RL."""
     seed = role_seed(config.seed, Role.LEARNER)
     if config.algorithm == "ddpg":

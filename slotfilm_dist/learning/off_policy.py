@@ -1,4 +1,4 @@
-"""What the off-policy learners share: state that is saved and loaded, metrics, and a halt when losses stop being finite."""
+"""What the off-policy learners share: saving and loading, metrics, and a halt when losses stop being finite."""
 
 import abc
 import warnings

@@ -34,6 +34,7 @@ from slotfilm_dist.messages import SampleBatch
 from slotfilm_dist.nets.interface import Encoder
 from slotfilm_dist.nets.policy_heads import Actor, TwinCritic, ValueNet
 
+
 class SacLearner(OffPolicyLearner):
     """Holds encoder, actor, critics and value network and improves them batch by batch.
 

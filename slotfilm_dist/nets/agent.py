@@ -26,9 +26,7 @@ def build_encoder(config: RunConfig, *, fetch_weights: bool = True) -> AgentEnco
     seed = role_number(config.seed, Role.ENCODER)
     if config.encoder.learns_from_pixels:
         return PixelEncoder(config.encoder, config.obs, config.env.image_size, seed=seed)
-    return SlotFusionEncoder(
-        config.encoder, config.obs, config.env.image_size, seed=seed, fetch_weights=fetch_weights
-    )
+    return SlotFusionEncoder(config.encoder, config.obs, config.env.image_size, seed=seed, fetch_weights=fetch_weights)
 
 
 def build_actor(

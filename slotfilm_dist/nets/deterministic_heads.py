@@ -1,4 +1,4 @@
-"""DrQ-v2's actor and critics (Yarats et al. 2021, Section 3.1): each with a trunk of its own on the shared convolutions."""
+"""DrQ-v2's actor and critics (Yarats et al. 2021, Section 3.1), each with a trunk of its own on the convolutions."""
 
 import torch
 from jaxtyping import Float

@@ -52,8 +52,7 @@ class RowRing:
         self._n_step, self._gamma = n_step, gamma
         self.schema = schema
         self.capacity_steps = capacity_steps
-        spare_rows = capacity_steps / block_steps + capacity_steps / STEPS_PER_EPISODE_END
-        self.num_rows = capacity_steps + math.ceil(spare_rows) + 1
+        self.num_rows = ring_rows(capacity_steps, block_steps)
         self._columns = {
             name: np.empty((self.num_rows, *column.shape), column.dtype) for name, column in schema.columns.items()
         }
@@ -220,6 +219,11 @@ class RowRing:
         ascending = bool((np.diff(stored) > 0).all())
         inside = bool((stored >= max(0, next_row - self.num_rows)).all() and (stored < next_row - 1).all())
         check(ascending and inside, "ring.step_rows", len(stored), "step rows out of order or outside the ring")
+
+
+def ring_rows(capacity_steps: int, block_steps: int) -> int:
+    """Rows allocated for so many steps in blocks of `block_steps`."""
+    return capacity_steps + math.ceil(capacity_steps / block_steps + capacity_steps / STEPS_PER_EPISODE_END) + 1
 
 
 def _check_array(saved: Any, mine: np.ndarray, name: str) -> None:

@@ -16,7 +16,7 @@ def test_task_is_registered_and_runs_400_steps_in_maniskills_vector_environment(
     assert gym.spec("PickBanana-v1") is not None
     env = ManiSkillVectorEnv(gym.make("PickBanana-v1", num_envs=1, obs_mode="state", render_backend="none"))
     env.reset(seed=1)
-    assert env.action_space.shape == (1, 7)
+    assert env.action_space.shape[-1] == 7
     action = torch.zeros(1, 7)
     for step in range(1, 401):
         _, reward, terminated, truncated, infos = env.step(action)

@@ -150,7 +150,7 @@ def test_yellow_pixels_of_the_banana_lie_where_it_is_projected() -> None:
         assert observation.rgb is not None
         assert observation.rgb.dtype == np.uint8
         red, green, blue = (observation.rgb[0, ..., i].astype(int) for i in range(3))
-        rows, columns = np.nonzero((red > blue + 60) & (green > blue + 40))
+        rows, columns = np.nonzero((red > blue + 80) & (green > 0.72 * red))
         if not observation.visible[0, 0] or len(rows) < 20:
             continue
         found += 1

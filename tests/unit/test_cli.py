@@ -87,7 +87,7 @@ def test_resuming_with_another_agent_is_refused(place: Path, capsys: pytest.Capt
 
 def test_second_driver_of_a_run_is_refused(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config: RunConfig = replace(smoke(), runtime=replace(smoke().runtime, mode="local"))
-    with RunDirectory.create(place / "run", config):
+    with RunDirectory(place / "run", config):
         before = contents(place)
         assert "is in use by process" in refusal(capsys, "train", "--resume", "run")
         assert contents(place) == before

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from slotfilm_dist.backend import Player, TrainReport
-from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config import RunConfig, load_config
 from slotfilm_dist.messages import EpisodeSummary, TransitionBlock
 from slotfilm_dist.pipeline import Interrupted, Pipeline, StopFlag
 from slotfilm_dist.presets import smoke
@@ -46,6 +46,13 @@ class CountingBackend:
         self.saved: list[dict[str, Any]] = []
         self.env_steps = config.schedule.random_steps
         self._during_play = during_play
+
+    def prepare(self) -> None:
+        self.calls.append("prepare")
+
+    def load_agent(self, checkpoints: Path) -> int:
+        self.calls.append("load agent")
+        return self.env_steps
 
     def random_blocks(self, num_steps: int, start: int) -> Iterator[TransitionBlock]:
         self.calls.append(f"random {start}+{num_steps}")
@@ -131,14 +138,14 @@ def test_phases_come_in_order_and_leave_a_report(tmp_path: Path) -> None:
     ]
     assert page.is_file()
     assert (tmp_path / "run" / "evaluation" / "final.json").is_file()
-    assert RunDirectory.resume(tmp_path / "run").read_status()["phase"] == "done"
+    assert RunDirectory(tmp_path / "run", load_config(tmp_path / "run" / "config.json")).read_status()["phase"] == "done"
 
 
 def test_second_run_takes_the_data_that_are_there_and_a_finished_run_only_evaluates(tmp_path: Path) -> None:
     execute(tmp_path, CountingBackend(config_of()))
     again = CountingBackend(config_of())
     execute(tmp_path, again)
-    assert again.calls == ["resume", "play random 10000000+2", "play agent 10000000+2"]
+    assert again.calls == ["load agent", "play random 10000000+2", "play agent 10000000+2"]
 
 
 def test_evaluations_during_training_come_on_time_and_keep_the_best(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from slotfilm_dist.config import RunConfig, load_config
 from slotfilm_dist.messages import EpisodeSummary
-from slotfilm_dist.runs import RunDirectory, new_run_directory
+from slotfilm_dist.runs import RunDirectory, new_run_directory, resumed_config
 
 CONFIG = RunConfig()
 
@@ -37,7 +37,7 @@ def test_existing_run_is_not_overwritten(tmp_path: Path) -> None:
 
 
 def test_entered_run_holds_config_versions_and_owner(tmp_path: Path) -> None:
-    with RunDirectory.create(tmp_path / "run", CONFIG) as run:
+    with RunDirectory(tmp_path / "run", CONFIG) as run:
         assert load_config(run.path / "config.json") == CONFIG
         versions = json.loads((run.path / "versions.json").read_text())
         assert {"torch", "python", "cpu", "command"} <= versions.keys()
@@ -47,38 +47,31 @@ def test_entered_run_holds_config_versions_and_owner(tmp_path: Path) -> None:
 
 
 def test_run_that_is_made_but_not_entered_leaves_nothing_behind(tmp_path: Path) -> None:
-    RunDirectory.create(tmp_path / "run", CONFIG)
+    RunDirectory(tmp_path / "run", CONFIG)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_second_driver_is_refused_and_changes_nothing(tmp_path: Path) -> None:
-    with RunDirectory.create(tmp_path / "run", CONFIG) as run:
+    with RunDirectory(tmp_path / "run", CONFIG) as run:
         before = {path.name: path.read_bytes() for path in run.path.iterdir()}
         changed = replace(CONFIG, schedule=replace(CONFIG.schedule, total_steps=2_000_000))
-        with pytest.raises(ValueError, match=r"is in use by process \d+ on"), RunDirectory.resume(run.path, changed):
+        with pytest.raises(ValueError, match=r"is in use by process \d+ on"), RunDirectory(run.path, changed):
             pass
         assert {path.name: path.read_bytes() for path in run.path.iterdir()} == before
-    with RunDirectory.resume(tmp_path / "run", changed):
+    with RunDirectory(tmp_path / "run", resumed_config(tmp_path / "run", CONFIG, changed)):
         assert load_config(tmp_path / "run" / "config.json") == changed
 
 
 def test_resuming_may_change_budgets_but_not_what_was_learned_from(tmp_path: Path) -> None:
-    with RunDirectory.create(tmp_path / "run", CONFIG):
-        pass
+    budget = replace(CONFIG, schedule=replace(CONFIG.schedule, total_steps=2_000_000))
+    assert resumed_config(tmp_path, CONFIG, budget) == budget
     other = replace(CONFIG, seed=4, sac=replace(CONFIG.sac, gamma=0.9))
     with pytest.raises(ValueError, match=r"seed, sac\.gamma cannot change in a run that has begun"):
-        RunDirectory.resume(tmp_path / "run", other)
-    assert load_config(tmp_path / "run" / "config.json") == CONFIG
-
-
-def test_missing_run_is_refused_and_not_made(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"config\.json does not exist"):
-        RunDirectory.resume(tmp_path / "run")
-    assert list(tmp_path.iterdir()) == []
+        resumed_config(tmp_path, CONFIG, other)
 
 
 def test_damaged_status_counts_as_none(tmp_path: Path) -> None:
-    with RunDirectory.create(tmp_path / "run", CONFIG) as run:
+    with RunDirectory(tmp_path / "run", CONFIG) as run:
         (run.path / "status.json").write_text("[1")
         assert run.read_status() == {}
 
@@ -94,7 +87,7 @@ def test_episodes_are_appended_as_lines(tmp_path: Path) -> None:
         grasped_once=True,
         reward_terms=(1.0, 0.5),
     )
-    with RunDirectory.create(tmp_path / "run", CONFIG) as run:
+    with RunDirectory(tmp_path / "run", CONFIG) as run:
         run.log_episodes([episode], 400, 3)
         run.log_episodes([episode, episode], 800, 4)
         lines = [json.loads(line) for line in (run.path / "episodes.jsonl").read_text().splitlines()]

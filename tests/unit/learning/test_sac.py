@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from slotfilm_dist.config import EncoderConfig, LrConfig, RunConfig, SacConfig
-from slotfilm_dist.learning.sac import MAX_SKIPPED, METRICS_EVERY, SacLearner, TrainingDivergedError
+from slotfilm_dist.learning.off_policy import MAX_SKIPPED, METRICS_EVERY, TrainingDivergedError
+from slotfilm_dist.learning.sac import SacLearner
 from slotfilm_dist.messages import SampleBatch
 from slotfilm_dist.nets.encoder import SlotFusionEncoder
 
@@ -34,6 +35,7 @@ def batch_of(encoder: EncoderConfig = STATE_ONLY, size: int = 8, seed: int = 0, 
     values: dict[str, Any] = {
         "action": rng.uniform(-1, 1, (size, 7)).astype(np.float32),
         "reward": rng.random(size, np.float32),
+        "discount": np.full(size, 0.99, np.float32),
         "terminated": np.zeros(size, bool),
         "truncated": np.zeros(size, bool),
     }
