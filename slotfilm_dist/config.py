@@ -531,6 +531,9 @@ class RuntimeConfig:
     """Steps a worker collects before it sends them."""
     publish_every: int = 50
     """Updates between weight snapshots."""
+    exact_resume: bool = False
+    """Build the simulator anew for every training episode (`local` mode; half a second each): a resumed run then equals
+    an uninterrupted one bit for bit. Without it PhysX's last digits depend on the episodes before."""
     metrics_port: int = 9464
     """Loopback port where Prometheus finds the run's metrics; 0 opens none. A taken port is stepped over."""
 

@@ -273,6 +273,7 @@ class LocalBackend:
         """The environment that training collects in, built at the first need."""
         if self._training_env is None:
             self._training_env = WristEnv(self._config, camera=self._config.encoder.uses_image)
+            self._training_env.fresh_episodes = self._config.runtime.exact_resume
         return self._training_env
 
     @property

@@ -1,6 +1,5 @@
 """The roles of a run as processes on a Ray cluster, behind the same interface as one process."""
 
-import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -15,9 +14,9 @@ from slotfilm_dist.cluster.placement import plan
 from slotfilm_dist.cluster.replay_client import ReplayClient, ShardClient
 from slotfilm_dist.cluster.reporting import Reporter
 from slotfilm_dist.cluster.role_clients import LearnerClient
-from slotfilm_dist.cluster.session import Session, read_cluster_file
+from slotfilm_dist.cluster.session import Session, namespace_of, read_cluster_file
 from slotfilm_dist.cluster.system import ShardWatch
-from slotfilm_dist.cluster.workforce import Workforce
+from slotfilm_dist.cluster.workforce import Workforce, make_wrist_env
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.contracts import VectorEnv
 from slotfilm_dist.machine import usable_cores
@@ -44,18 +43,6 @@ MAX_LEARNER_RESTARTS = 10
 """Losses of the learner before the run is given up."""
 INCARNATIONS_PER_START = 100_000
 """Incarnations of one start of a run; the next start counts on from a higher number than any before."""
-
-
-def make_wrist_env(config: RunConfig, camera: bool) -> VectorEnv:
-    """The simulator."""
-    from slotfilm_dist.envs.wrist_env import WristEnv
-
-    return WristEnv(config, camera=camera)
-
-
-def namespace_of(run: Path) -> str:
-    """Under what name a run's hub is found."""
-    return "slotfilm-" + re.sub(r"[^A-Za-z0-9._-]", "-", run.resolve().name)
 
 
 class RayBackend:
@@ -170,7 +157,7 @@ class RayBackend:
         """Train until the schedule's end, or until `should_stop`, reporting once a second."""
         self._build_replay()
         workers, reporter = self._workers, Reporter(self._config)
-        self._connect_learner()
+        self._learning.call("start", timeout_s=LONG_S)
         assert self._setup is not None, "begin_training comes first"
         workers.train(self._shards, self._watch, self._setup)
         finished = False
@@ -290,9 +277,6 @@ class RayBackend:
 
     def _replay_client(self) -> ReplayClient:
         return ReplayClient(self._shards, role_seed(self._config.seed, Role.REPLAY, 0, self._learner_restarts))
-
-    def _connect_learner(self) -> None:
-        self._learning.call("start", timeout_s=LONG_S)
 
     def _learner_status(self) -> LearnerStatus:
         """How the learner does; a lost one is replaced and goes on from the last checkpoint.

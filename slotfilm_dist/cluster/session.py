@@ -4,6 +4,7 @@ import contextlib
 import json
 import logging
 import os
+import re
 import secrets
 import shutil
 import signal
@@ -132,6 +133,11 @@ class Session:
     @staticmethod
     def _environment_now(name: str) -> str:
         return os.environ.get(name, "")
+
+
+def namespace_of(run: Path) -> str:
+    """Under what name a run's hub is found."""
+    return "slotfilm-" + re.sub(r"[^A-Za-z0-9._-]", "-", run.resolve().name)
 
 
 def read_cluster_file(run: Path) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from slotfilm_dist.cluster.role_clients import WorkerClient
 from slotfilm_dist.cluster.session import Session
 from slotfilm_dist.cluster.system import ShardWatch, Supervisor
 from slotfilm_dist.config import RunConfig
+from slotfilm_dist.contracts import VectorEnv
 from slotfilm_dist.messages import TransitionBlock
 from slotfilm_dist.replay.ledger import shard_of
 from slotfilm_dist.seeds import Role, role_seed
@@ -24,6 +25,13 @@ TAKE_S = 1.0
 """Longest wait of one request for the random policy's blocks."""
 INSERT_STREAMS = 1_000_000
 """Workers' replay clients draw from streams beyond those of the shards; they never sample, but have one."""
+
+
+def make_wrist_env(config: RunConfig, camera: bool) -> VectorEnv:
+    """The simulator."""
+    from slotfilm_dist.envs.wrist_env import WristEnv
+
+    return WristEnv(config, camera=camera)
 
 
 class Workforce:

@@ -73,6 +73,8 @@ class WristEnv:
         self._elapsed = np.zeros(num_envs, np.int64)
         self.episode_steps = config.env.max_steps
         """Steps after which an episode is truncated."""
+        self.fresh_episodes = False
+        """Build the simulator anew also where `step` resets it."""
 
     @property
     def has_camera(self) -> bool:
@@ -147,6 +149,8 @@ class WristEnv:
 
     def _restart(self, over: np.ndarray, next_seeds: Sequence[int]) -> Observation:
         indices = np.flatnonzero(over)
+        if self.fresh_episodes and len(indices) == self.num_envs:
+            return self.reset(next_seeds)
         self._env.reset(
             seed=[int(next_seeds[i]) for i in indices],
             options={"env_idx": torch.as_tensor(indices, device=self._env.device)},

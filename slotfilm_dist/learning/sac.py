@@ -148,7 +148,7 @@ class SacLearner(OffPolicyLearner):
         critic_loss: Float[Tensor, ""],
         value_loss: Float[Tensor, ""],
         actor_loss: Float[Tensor, ""],
-        q: Float[Tensor, "2 batch"],
+        q: Float[Tensor, "2 seen"],
         target: Float[Tensor, " batch"],
         log_prob: Float[Tensor, " batch"],
         temperature: Float[Tensor, ""],

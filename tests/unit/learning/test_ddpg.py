@@ -106,36 +106,28 @@ def test_actor_climbs_the_smaller_critic_and_gets_no_entropy() -> None:
     assert measured(learner, batch_of())["learner_actor_loss"] == pytest.approx(-4.0, rel=1e-5)
 
 
-def test_only_the_critics_train_the_encoder() -> None:
-    learner, batch = build(), batch_of()
-    with torch.no_grad():
-        for target in learner.target_critic.parameters():
-            target.zero_()
-        q = learner.critic(learner._encode(batch.visual, batch.proprio, batch.goal), torch.from_numpy(batch.action))
-    # Where the critics' error is 0 there is nothing to learn from, and the actor's gradient stops at the latent.
-    learner._noise.manual_seed(3)
-    shifted = learner._encode(batch.visual, batch.proprio, batch.goal)
-    assert shifted.requires_grad
-    assert q.shape == (2, 6)
+def test_one_update_moves_every_network() -> None:
+    learner = build()
     before = {name: copies(module) for name, module in learner.modules().items()}
-    learner.update(batch)
-    assert all(moved(before["encoder"], learner.encoder))  # type: ignore[arg-type]  # an encoder is a module
-    assert any(moved(before["critic"], learner.critic))
-    assert all(moved(before["actor"].copy(), learner.actor))
+    learner.update(batch_of())
+    for name, module in learner.modules().items():
+        assert any(moved(before[name], module)), name
+    assert all(moved(before["encoder"], learner.modules()["encoder"]))
+    assert all(moved(before["actor"], learner.actor))
 
 
 def test_actor_loss_reaches_neither_encoder_nor_critics() -> None:
     learner, batch = build(), batch_of()
     set_constant(learner.critic, 0.0, 0.0)
     set_constant(learner.target_critic, 0.0, 0.0)
-    encoder, trunk = copies(learner.encoder), copies(learner.critic.trunk)  # type: ignore[arg-type]
+    encoder, trunk = copies(learner.modules()["encoder"]), copies(learner.critic.trunk)
     with (
         torch.no_grad()
     ):  # Q depends on the action alone and predicts its target, so only the actor's loss has a gradient
         for network in (learner.critic.ensemble, learner.target_critic.ensemble):
             network.weights[0].zero_()
     learner.update(replace(batch, reward=np.zeros(6, np.float32)))
-    assert not any(moved(encoder, learner.encoder))  # type: ignore[arg-type]
+    assert not any(moved(encoder, learner.modules()["encoder"]))
     assert not any(moved(trunk, learner.critic.trunk))
 
 

@@ -137,7 +137,7 @@ def test_acting_state_carries_convolutions_and_statistics_to_a_worker() -> None:
 
 
 def test_weights_of_another_encoder_are_refused() -> None:
-    with pytest.raises(ValueError, match="'norm.bias' is in only one of them"):
+    with pytest.raises(ValueError, match=r"'norm.bias' is in only one of them"):
         small("cnn").load_acting_state(small("drq").acting_state())
     arrays = small("cnn").acting_state() | {"projection.bias": np.zeros(3, np.float32)}
     with pytest.raises(ValueError, match=r"projection.bias is \(3,\), here \(50,\)"):
