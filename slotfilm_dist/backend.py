@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from slotfilm_dist.messages import EpisodeSummary, TransitionBlock
 
@@ -25,6 +25,7 @@ class TrainReport:
     """Training episodes that ended, each with the version of the weights that acted."""
 
 
+@runtime_checkable
 class Backend(Protocol):
     """The roles of one run. Every method that takes long gives control back regularly, so that a run can be stopped."""
 

@@ -10,7 +10,7 @@ while True:
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
@@ -18,6 +18,7 @@ from jaxtyping import Float32
 from slotfilm_dist.messages import Observation, SampleBatch, StepResult, TransitionBlock, WeightSnapshot
 
 
+@runtime_checkable
 class VectorEnv(Protocol):
     """Environments stepped together that reset themselves in the step that ends an episode."""
 
@@ -38,6 +39,7 @@ class VectorEnv(Protocol):
         ...
 
 
+@runtime_checkable
 class ReplayStore(Protocol):
     """Where transitions wait for the learner."""
 
@@ -54,6 +56,7 @@ class ReplayStore(Protocol):
         ...
 
 
+@runtime_checkable
 class WeightSource(Protocol):
     """Where a worker gets its policy."""
 
@@ -62,6 +65,7 @@ class WeightSource(Protocol):
         ...
 
 
+@runtime_checkable
 class MetricSink(Protocol):
     """Where numbers go."""
 
@@ -70,6 +74,7 @@ class MetricSink(Protocol):
         ...
 
 
+@runtime_checkable
 class Saveable(Protocol):
     """Anything with state: loading what was saved continues as if nothing had happened."""
 

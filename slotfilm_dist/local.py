@@ -162,8 +162,9 @@ class LocalBackend:
         self._loop = RolloutLoop(self._env, self._policy, role_seed(config.seed, Role.EPISODES))
         if values:
             self._limiter.load(values["limiter"])
-            self._loop.load(values["rollout"])
-            self._policy.load_noise(values["noise"])
+            if "rollout" in values:  # a checkpoint written on a cluster has neither: its workers draw anew
+                self._loop.load(values["rollout"])
+                self._policy.load_noise(values["noise"])
         return values
 
     def load_agent(self, checkpoints: Path) -> int:

@@ -84,7 +84,8 @@ class DeterministicActor(nn.Module):
         if clip is not None:
             scaled = scaled.clamp(-clip, clip)
         action = self.mode(latent) + scaled
-        return action + (action.clamp(-LARGEST_ACTION, LARGEST_ACTION) - action).detach()
+        # In this order the sum is exactly the clamped action.
+        return action - action.detach() + action.clamp(-LARGEST_ACTION, LARGEST_ACTION).detach()
 
     def explore(
         self, latent: Float[Tensor, "batch latent"], noise: Float[Tensor, "batch action"]

@@ -1,7 +1,7 @@
 """What the rest of the system asks of an encoder, whatever is inside it."""
 
 from collections.abc import Mapping
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
@@ -11,6 +11,7 @@ VisualKind = Literal["tokens", "rgb", "none"]
 """What replay keeps of a picture: a frozen backbone's tokens, the picture itself, or nothing."""
 
 
+@runtime_checkable
 class Encoder(Protocol):
     """Turns an observation into the latent of actor and critics; a `nn.Module`.
 

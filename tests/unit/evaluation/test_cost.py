@@ -6,6 +6,7 @@ import pytest
 
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.evaluation.cost import cost_of
+from slotfilm_dist.variants import apply_variant
 
 
 @pytest.mark.parametrize(
@@ -22,3 +23,18 @@ def test_parameters_are_those_of_the_paper(fusion: str, encoder_params: int, act
     assert row.latency_ms_mean > 0
     assert row.peak_memory_mb > 10
     assert row.device.startswith("cpu")
+
+
+@pytest.mark.parametrize(
+    ("variant", "encoder_params", "actor_params"),
+    [
+        # Four convolutions of 32 filters: 896 + 3 x 9,248 = 28,640.
+        ("cnn", 28_640 + 1_568 * 42 + 42, 80_398),
+        ("cnn_state", 28_640 + 1_568 * 42 + 42, 89_358),
+        ("drq", 28_640 + 103_968 * 50 + 50 + 100, 82_446),
+        ("drqv2", 28_640, 103_968 * 50 + 50 + 100 + 50 * 1024 + 1024 + 1024 * 1024 + 1024 + 1024 * 7 + 7),
+    ],
+)
+def test_parameters_of_the_pixel_baselines(variant: str, encoder_params: int, actor_params: int) -> None:
+    row = cost_of(apply_variant(variant, RunConfig()))
+    assert (row.encoder_params, row.actor_params) == (encoder_params, actor_params)

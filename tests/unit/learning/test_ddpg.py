@@ -117,18 +117,19 @@ def test_one_update_moves_every_network() -> None:
 
 
 def test_actor_loss_reaches_neither_encoder_nor_critics() -> None:
-    learner, batch = build(), batch_of()
-    set_constant(learner.critic, 0.0, 0.0)
-    set_constant(learner.target_critic, 0.0, 0.0)
-    encoder, trunk = copies(learner.modules()["encoder"]), copies(learner.critic.trunk)
-    with (
-        torch.no_grad()
-    ):  # Q depends on the action alone and predicts its target, so only the actor's loss has a gradient
-        for network in (learner.critic.ensemble, learner.target_critic.ensemble):
-            network.weights[0].zero_()
-    learner.update(replace(batch, reward=np.zeros(6, np.float32)))
-    assert not any(moved(encoder, learner.modules()["encoder"]))
-    assert not any(moved(trunk, learner.critic.trunk))
+    """Critics that predict their targets exactly get no gradient of their own; what they have came from the actor."""
+    learner, batch = build(), batch_of(terminated=np.ones(6, bool))
+    with torch.no_grad():
+        first = learner.critic.ensemble.weights[0]
+        first[:, :8] = 0.0  # Q depends on the action alone, not on the picture
+        for weight in learner.critic.ensemble.weights:
+            weight[1] = weight[0]
+        latent = learner._encode(batch.visual, batch.proprio, batch.goal)
+        reward = learner.critic(latent, torch.from_numpy(batch.action))[0]
+    learner.update(replace(batch, reward=reward.numpy()))
+    for module in (learner.modules()["encoder"], learner.critic):
+        assert all(p.grad is None or not p.grad.any() for p in module.parameters())
+    assert all(p.grad is not None and p.grad.any() for p in learner.actor.parameters())
 
 
 def test_target_critics_follow_at_their_rate_trunk_included() -> None:
