@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
-from slotfilm_dist.config import PROPRIO_FIELDS, RunConfig, changed_fields
+from slotfilm_dist.config import PROPRIO_FIELDS, LrConfig, RunConfig, changed_fields
 
 Variant = Callable[[RunConfig], RunConfig]
 
@@ -50,13 +50,14 @@ def state_only(base: RunConfig) -> RunConfig:
 
 def cnn(base: RunConfig) -> RunConfig:
     """A plain convolutional network that learns from the critics, without the state (Section 5.1)."""
-    return _on_pixels(base, "cnn", base.encoder.feature_dim)
+    pixels = _on_pixels(base, "cnn", base.encoder.feature_dim)
+    return replace(pixels, lr=_with_the_critics(base))
 
 
 def drq(base: RunConfig) -> RunConfig:
     """DrQ-v1's encoder and its averages over two random shifts on the same SAC, without the state (Section 5.1)."""
     pixels = _on_pixels(base, "drq", DRQ_FEATURES)
-    return replace(pixels, sac=replace(base.sac, augment_views=2))
+    return replace(pixels, lr=_with_the_critics(base), sac=replace(base.sac, augment_views=2))
 
 
 def drqv2(base: RunConfig) -> RunConfig:
@@ -65,8 +66,8 @@ def drqv2(base: RunConfig) -> RunConfig:
     total_steps = max(schedule.total_steps * 2 // 3, schedule.random_steps)
     return replace(
         pixels,
-        # The noise falls until 500k of the 800k steps, and over the same share of a shorter run.
-        ddpg=replace(base.ddpg, std_steps=max(1, total_steps * 5 // 8)),
+        # The noise falls until step 500k of 800k, which is 4/7 of the learning, and as far in a shorter run.
+        ddpg=replace(base.ddpg, std_steps=schedule.random_steps + (total_steps - schedule.random_steps) * 4 // 7),
         sac=replace(base.sac, batch_size=2 * base.sac.batch_size),
         schedule=replace(schedule, total_steps=total_steps, updates_per_step=schedule.updates_per_step / 2),
     )
@@ -88,15 +89,19 @@ def drqv2_state(base: RunConfig) -> RunConfig:
 
 
 def _on_pixels(base: RunConfig, kind: Literal["cnn", "drq", "drqv2"], feature_dim: int) -> RunConfig:
-    """No pre-training and no slots; the encoder learns from nothing, at the critics' rate of which it is a part."""
+    """No pre-training and no slots: the encoder learns from pictures and reward alone."""
     encoder = replace(base.encoder, kind=kind, feature_dim=feature_dim, backbone="random", fusion="none", goal=False)
     return replace(
         base,
         algorithm="ddpg" if kind == "drqv2" else "sac",
         encoder=encoder,
         pretrain=replace(base.pretrain, steps=0),
-        lr=replace(base.lr, fusion=base.lr.critic_value),
     )
+
+
+def _with_the_critics(base: RunConfig) -> LrConfig:
+    """The encoder's rate is that of the critics, whose part it is while it learns from nothing."""
+    return replace(base.lr, fusion=base.lr.critic_value)
 
 
 def _with_state(pixels: RunConfig) -> RunConfig:

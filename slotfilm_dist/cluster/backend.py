@@ -172,7 +172,7 @@ class RayBackend:
             finished = counts.finished and counts.updates_owed == 0 and status.updates >= counts.updates
         workers.stop()
         self._learning.call("stop", STOP_S, timeout_s=2 * STOP_S)
-        self._watch.tick()
+        self._watch.tick(wait=True)
         yield self._report(reporter, self._learner_status())
 
     def play(self, player: Player, seeds: Sequence[int]) -> Iterator[EpisodeSummary]:

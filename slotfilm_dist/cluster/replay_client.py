@@ -93,6 +93,14 @@ class ShardClient:
         """How it does; waits until its process has started."""
         return self._link.answer(self._link.begin("call", "beat"), "how it does", timeout_s)
 
+    def look(self) -> ShardBeat | None:
+        """A beat of now, None if it does not answer."""
+        try:
+            self._last = self.beat(DRAW_S)
+        except (RoleLostError, RoleSilentError):
+            self._last = None
+        return self._last
+
     def poll(self) -> ShardBeat | None:
         """The last beat, None while it does not answer; never waits."""
         if self._question is None:

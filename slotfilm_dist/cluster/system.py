@@ -228,6 +228,10 @@ class ShardHandle(Protocol):
         """Its last beat; never waits; None while it does not answer."""
         ...
 
+    def look(self) -> ShardBeat | None:
+        """A beat of now; waits for it; None if it does not answer."""
+        ...
+
 
 class ShardWatch:
     """Counts the shards' restarts and notices when too little is left to learn from.
@@ -250,10 +254,10 @@ class ShardWatch:
         """Steps stored in the shards that answer."""
         return sum(beat.stats.num_steps for beat in self.beats.values())
 
-    def tick(self) -> None:
-        """Look at every shard once."""
+    def tick(self, *, wait: bool = False) -> None:
+        """Look at every shard once; with `wait` at what it is now, otherwise at what it last said."""
         for shard in self._shards:
-            beat = shard.poll()
+            beat = shard.look() if wait else shard.poll()
             if beat is None:
                 self.beats.pop(shard.index, None)
                 continue

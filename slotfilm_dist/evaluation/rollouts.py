@@ -50,8 +50,8 @@ class Recorder:
     """
 
     def __init__(self, encoder: Encoder | None) -> None:
-        sees = isinstance(encoder, SlotFusionEncoder) and encoder.perception is not None
-        self._encoder: SlotFusionEncoder | None = encoder if sees else None
+        slots = encoder if isinstance(encoder, SlotFusionEncoder) else None
+        self._encoder = slots if slots is not None and slots.perception is not None else None
         self.frames: list[RolloutFrame] = []
 
     @torch.inference_mode()

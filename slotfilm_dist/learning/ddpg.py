@@ -45,7 +45,7 @@ from slotfilm_dist.nets.deterministic_heads import DeterministicActor, TrunkTwin
 from slotfilm_dist.nets.pixel_encoder import PixelEncoder
 
 
-class DdpgLearner(OffPolicyLearner):
+class DdpgLearner(OffPolicyLearner[DeterministicActor]):
     """Holds encoder, actor, critics and target critics and improves them batch by batch.
 
     Args:
@@ -55,8 +55,6 @@ class DdpgLearner(OffPolicyLearner):
         seed: root of the initial weights, the shifts and the noise.
         device: where to compute.
     """
-
-    actor: DeterministicActor
 
     def __init__(
         self,
@@ -149,7 +147,6 @@ class DdpgLearner(OffPolicyLearner):
 
     def modules(self) -> dict[str, torch.nn.Module]:
         """Every network by name, for checkpoints."""
-        assert isinstance(self.encoder, torch.nn.Module)
         return {
             "encoder": self.encoder,
             "actor": self.actor,

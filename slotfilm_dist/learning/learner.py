@@ -26,7 +26,6 @@ from slotfilm_dist.config import RunConfig, config_hash
 from slotfilm_dist.learning.checkpoint import Checkpoint, plain_tensors
 from slotfilm_dist.learning.ddpg import DdpgLearner
 from slotfilm_dist.learning.frames import PretrainFrames
-from slotfilm_dist.learning.off_policy import OffPolicyLearner
 from slotfilm_dist.learning.pretrain import Pretrainer
 from slotfilm_dist.learning.sac import SacLearner
 from slotfilm_dist.messages import SampleBatch, TransitionBlock, WeightSnapshot
@@ -37,6 +36,8 @@ from slotfilm_dist.nets.pixel_encoder import PixelEncoder
 from slotfilm_dist.replay.dataset import FrameDataset
 from slotfilm_dist.replay.schema import ReplaySchema
 from slotfilm_dist.seeds import Role, role_number, role_seed
+
+RlLearner = SacLearner | DdpgLearner
 
 SMALLEST_STD = 1e-2
 """Least deviation that the state is divided by: a field that barely moves at random may matter later."""
@@ -81,10 +82,10 @@ class Learner:
         self._action_dim = action_dim
         self.encoder: AgentEncoder = build_encoder(config, fetch_weights=fetch_weights).to(device)
         self._pretrainer: Pretrainer | None = None
-        self._rl: OffPolicyLearner | None = None
+        self._rl: RlLearner | None = None
 
     @property
-    def rl(self) -> OffPolicyLearner:
+    def rl(self) -> RlLearner:
         """The RL half; exists after `begin_rl`."""
         assert self._rl is not None, "begin_rl comes first"
         return self._rl
@@ -239,7 +240,7 @@ def learning_hash(config: RunConfig) -> str:
     return config_hash(config.variant, config.seed, config.env, config.obs, config.encoder, config.sac, *own)
 
 
-def build_rl(config: RunConfig, encoder: AgentEncoder, action_dim: int, device: torch.device) -> OffPolicyLearner:
+def build_rl(config: RunConfig, encoder: AgentEncoder, action_dim: int, device: torch.device) -> RlLearner:
     """The algorithm that a config asks for, on an encoder that is ready for RL."""
     seed = role_seed(config.seed, Role.LEARNER)
     if config.algorithm == "ddpg":

@@ -3,7 +3,7 @@
 import abc
 import warnings
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -12,8 +12,9 @@ from torch import Tensor
 
 from slotfilm_dist.learning.checkpoint import plain_tensors
 from slotfilm_dist.messages import SampleBatch
-from slotfilm_dist.nets.agent import AgentActor
-from slotfilm_dist.nets.interface import Encoder
+from slotfilm_dist.nets.agent import AgentEncoder
+from slotfilm_dist.nets.deterministic_heads import DeterministicActor
+from slotfilm_dist.nets.policy_heads import Actor
 
 METRICS_EVERY = 10
 """Updates between measurements of the metrics; reading them every time would cost a tenth of an update."""
@@ -21,11 +22,14 @@ MAX_SKIPPED = 10
 """Non-finite updates in a row after which the learner stops."""
 
 
+ActorT = TypeVar("ActorT", Actor, DeterministicActor)
+
+
 class TrainingDivergedError(RuntimeError):
     """Losses were not finite for `MAX_SKIPPED` updates in a row."""
 
 
-class OffPolicyLearner(abc.ABC):
+class OffPolicyLearner(abc.ABC, Generic[ActorT]):
     """An encoder and networks on its latent that improve batch by batch.
 
     Args:
@@ -34,11 +38,9 @@ class OffPolicyLearner(abc.ABC):
         device: where to compute.
     """
 
-    encoder: Encoder
-    actor: AgentActor
+    actor: ActorT
 
-    def __init__(self, encoder: Encoder, noise_seed: int, device: torch.device) -> None:
-        assert isinstance(encoder, torch.nn.Module)
+    def __init__(self, encoder: AgentEncoder, noise_seed: int, device: torch.device) -> None:
         self.encoder = encoder.to(device)
         self.device = device
         self.updates = 0

@@ -1,21 +1,22 @@
 """Soft Actor-Critic on an encoder: one `update` is one line of Algorithm 1's loop.
 
 With `sac.augment_views = 2` it is the study's DrQ-v1 (Kostrikov et al. 2020, Algorithm 1 with K = M = 2) on the paper's
-SAC with a value network, of which "all SAC-based methods share identical hyperparameters" (Section 5.1):
+SAC with a value network; "all SAC-based methods share identical SAC hyperparameters" (Section 5.1). Point by point:
 
-published                                          here
-K shifts of s' in the target, each with an action  the target value network's mean over K shifts of s'; its soft value
-of its own, target critics' soft value averaged    stands for the expectation over actions
-M shifts of s in the critics' loss, averaged       the same
-actor and temperature see one shift of s           the same, and so does the value network's loss, which takes the place
-                                                   of the target critics' expectation and is not averaged over shifts
-shifts by whole pixels up to 4, border repeated    the same
-encoder trained by the critics, with their rate    the same (`lr.fusion` of the variant is `lr.critic_value`)
-target critics with an encoder of their own        the value network's target; s' is encoded by the online encoder
-actor with a projection of its own                 one latent for all, see `nets.pixel_encoder`
-batch 512, 1024 x 1024 layers, all rates 1e-3,     Table A1, as for every agent on SAC
-temperature tuned from 0.1, critics' Polyak 0.01
-every 2nd update, actor every 2nd update
+published                                           here
+target: soft value of the target critics, averaged  target value network, averaged over K shifts of s'; the value
+over K shifts of s', an action drawn for each       network stands for the expectation over actions and entropy
+critics' loss averaged over M shifts of s           the same
+actor and temperature see one shift of s            the same; the value network's own loss sees that shift too
+shifts by whole pixels up to 4, border repeated     the same
+encoder trained by the critics only, at their rate  the same (the variant sets `lr.fusion` to `lr.critic_value`)
+
+Departures:
+- s' goes through the online encoder: the target critics' own, slowly following encoder has no counterpart, for the only
+  target network of this SAC reads a latent.
+- Actor, critics and value network share one latent, see `nets.pixel_encoder`.
+- Table A1 and `sac` give all numbers, not the publication: batch 512, 1024 x 1024 layers, every rate 1e-3, temperature
+  tuned from 0.1, Polyak rate 0.01, actor and targets every 2nd update.
 """
 
 import math
@@ -31,11 +32,11 @@ from slotfilm_dist.learning import losses
 from slotfilm_dist.learning.augment import random_shift
 from slotfilm_dist.learning.off_policy import METRICS_EVERY, OffPolicyLearner, gradient_norm
 from slotfilm_dist.messages import SampleBatch
-from slotfilm_dist.nets.interface import Encoder
+from slotfilm_dist.nets.agent import AgentEncoder
 from slotfilm_dist.nets.policy_heads import Actor, TwinCritic, ValueNet
 
 
-class SacLearner(OffPolicyLearner):
+class SacLearner(OffPolicyLearner[Actor]):
     """Holds encoder, actor, critics and value network and improves them batch by batch.
 
     Args:
@@ -47,7 +48,12 @@ class SacLearner(OffPolicyLearner):
     """
 
     def __init__(
-        self, config: RunConfig, encoder: Encoder, action_dim: int, seed: np.random.SeedSequence, device: torch.device
+        self,
+        config: RunConfig,
+        encoder: AgentEncoder,
+        action_dim: int,
+        seed: np.random.SeedSequence,
+        device: torch.device,
     ) -> None:
         init_seed, noise_seed = (int(s.generate_state(1)[0]) for s in seed.spawn(2))
         super().__init__(encoder, noise_seed, device)
