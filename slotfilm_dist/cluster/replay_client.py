@@ -154,6 +154,10 @@ class ReplayClient:
         """Store a block in its shard; False if it had been stored before."""
         return self._shard_of(block).insert(block)
 
+    def index_of(self, block: TransitionBlock) -> int:
+        """The shard that takes a block."""
+        return shard_of(block.worker_id, block.sequence, len(self._shards))
+
     def insert_all(self, blocks: Iterable[TransitionBlock]) -> int:
         """Store blocks, a few at a time; gives the steps in them."""
         under_way: list[tuple[ShardClient, Any]] = []
@@ -226,4 +230,4 @@ class ReplayClient:
                 self._counts[i] = shard.begin_count()
 
     def _shard_of(self, block: TransitionBlock) -> ShardClient:
-        return self._shards[shard_of(block.worker_id, block.sequence, len(self._shards))]
+        return self._shards[self.index_of(block)]

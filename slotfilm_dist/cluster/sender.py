@@ -14,6 +14,8 @@ ADMIT_S = 1.0
 """Longest wait of one request to the limiter."""
 RETRY_S = 0.2
 """Pause before a shard that did not take a block is asked again."""
+MAX_PARKED = 32
+"""Blocks kept for a shard that does not answer, while those for the others go on; 6 MB of tokens."""
 
 
 @runtime_checkable
@@ -40,7 +42,11 @@ class StoreLink(Protocol):
     """What a worker asks of replay."""
 
     def insert(self, block: TransitionBlock) -> bool:
-        """Store a block once."""
+        """Store a block once; may be called by two threads."""
+        ...
+
+    def index_of(self, block: TransitionBlock) -> int:
+        """The shard that takes it."""
         ...
 
 
@@ -48,8 +54,9 @@ class BlockSender:
     """Asks the limiter for each block, then stores it, in a thread of its own.
 
     Consumes blocks, one waiting and one under way; produces stored blocks, and weights that came with an answer. Waits
-    for the limiter, then for the block's shard, which it asks again until it answers; the same block is stored once.
-    Ends when closed, when the run has all its steps, or when the hub is gone.
+    for the limiter, then for the block's shard. Blocks for a shard that does not answer are parked, up to `MAX_PARKED`,
+    and a second thread offers them until it answers, so that the other shards go on being filled; the same block is
+    stored once. Ends when closed, when the run has all its steps, or when the hub is gone.
 
     Args:
         hub: admits.
@@ -59,13 +66,18 @@ class BlockSender:
     def __init__(self, hub: HubLink, store: StoreLink) -> None:
         self._hub, self._store = hub, store
         self._queue: queue.Queue[TransitionBlock | None] = queue.Queue(1)
+        self._parked: queue.Queue[TransitionBlock] = queue.Queue(MAX_PARKED)
+        self._silent_shard = -1
         self._closing = threading.Event()
+        self._stored_lock = threading.Lock()
         self._stored: list[BlockKey] = []
         self._snapshot: WeightSnapshot | None = None
         self._held_version = -1
         self._waiting_for = "room for a block"
         self._error: Exception | None = None
         self.finished = False
+        self._parking = threading.Thread(target=self._offer_parked, name="parked-blocks", daemon=True)
+        self._parking.start()
         self._thread = threading.Thread(target=self._run, name="block-sender", daemon=True)
         self._thread.start()
 
@@ -103,6 +115,7 @@ class BlockSender:
         """Finish the block that was admitted, drop the others, confirm, and end."""
         self._closing.set()
         self._thread.join()
+        self._parking.join()
 
     def _run(self) -> None:
         try:
@@ -113,18 +126,16 @@ class BlockSender:
                     continue
                 if block is not None and self._admit(block):
                     self._deliver(block)
-            self._hub.confirm(self._stored)
+            self._hub.confirm(self._take_stored())
         except Exception as error:  # raised again in the thread that offers blocks
             self._error = error
 
     def _admit(self, block: TransitionBlock) -> bool:
-        key = BlockKey(worker_id=block.worker_id, incarnation=block.incarnation, sequence=block.sequence)
         notice = BlockNotice(
-            key=key, num_steps=block.num_steps, policy_version=block.policy_version, episodes=block.episodes
+            key=_key(block), num_steps=block.num_steps, policy_version=block.policy_version, episodes=block.episodes
         )
         while not self._closing.is_set():
-            grant = self._hub.admit_steps(notice, self._stored, self._held_version, ADMIT_S)
-            self._stored = []
+            grant = self._hub.admit_steps(notice, self._take_stored(), self._held_version, ADMIT_S)
             if grant.snapshot is not None:
                 self._snapshot = grant.snapshot
             if grant.finished:
@@ -136,16 +147,51 @@ class BlockSender:
         return False
 
     def _deliver(self, block: TransitionBlock) -> None:
-        """Store an admitted block; a shard that is being restarted is asked until it answers, or the loop is closed."""
+        """Store an admitted block, or park it while its shard does not answer."""
         self._waiting_for = "replay to store a block"
-        while True:
-            try:
-                self._store.insert(block)
-                break
-            except (RoleLostError, RoleSilentError) as error:
-                self._waiting_for = str(error)
-                if self._closing.is_set():
-                    return
-                time.sleep(RETRY_S)
-        self._stored.append(BlockKey(worker_id=block.worker_id, incarnation=block.incarnation, sequence=block.sequence))
+        if self._store.index_of(block) == self._silent_shard or not self._insert(block):
+            self._silent_shard = self._store.index_of(block)
+            while not self._closing.is_set():
+                try:
+                    self._parked.put(block, timeout=RETRY_S)
+                    break
+                except queue.Full:
+                    continue
         self._waiting_for = "room for a block"
+
+    def _offer_parked(self) -> None:
+        """Store parked blocks in their order, as soon as their shard answers."""
+        while not (self._closing.is_set() and self._parked.empty()):
+            try:
+                block = self._parked.get(timeout=RETRY_S)
+            except queue.Empty:
+                continue
+            while not self._insert(block):
+                if self._closing.is_set():
+                    return  # the hub takes back what was admitted and never stored
+                time.sleep(RETRY_S)
+            if self._parked.empty():
+                self._silent_shard = -1
+
+    def _insert(self, block: TransitionBlock) -> bool:
+        """Whether the shard answered; a refused block is an error of the thread that offers blocks."""
+        try:
+            self._store.insert(block)
+        except (RoleLostError, RoleSilentError) as error:
+            self._waiting_for = str(error)
+            return False
+        except Exception as error:
+            self._error = error
+            raise
+        with self._stored_lock:
+            self._stored.append(_key(block))
+        return True
+
+    def _take_stored(self) -> list[BlockKey]:
+        with self._stored_lock:
+            stored, self._stored = self._stored, []
+        return stored
+
+
+def _key(block: TransitionBlock) -> BlockKey:
+    return BlockKey(worker_id=block.worker_id, incarnation=block.incarnation, sequence=block.sequence)

@@ -88,6 +88,8 @@ def test_learner_waits_while_all_workers_are_gone_and_goes_on(live: LiveRun) -> 
 
 
 def test_sampling_goes_on_without_a_killed_shard(live: LiveRun) -> None:
+    # Enough that the other shard alone holds `replay.min_steps`, below which no update is made.
+    live.until(lambda r: r.metrics["replay_stored_steps"] > 600, "steps to learn from")
     before = live.last
     os.kill(live.backend.process_ids()["shard 1"], signal.SIGKILL)
     killed_at = time.monotonic()
