@@ -23,8 +23,8 @@ from slotfilm_dist.messages import EpisodeSummary
 
 PACKAGES = ("ray", "torch", "torchvision", "mani_skill", "sapien", "gymnasium", "numpy", "msgpack", "safetensors")
 RUN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-RESUMABLE = ("schedule", "evaluation", "runtime", "checkpoint")
-"""Sections that may change when a run is resumed."""
+RESUMABLE = ("schedule", "evaluation", "runtime", "checkpoint", "lr", "sac.temperature", "sac.temperature_mode")
+"""Sections and fields that may change when a run is resumed: budgets, places, and what is annealed by hand."""
 
 
 def new_run_directory(root: Path, config: RunConfig, preset: str, name: str = "") -> Path:
@@ -48,7 +48,8 @@ def new_run_directory(root: Path, config: RunConfig, preset: str, name: str = ""
 
 def resumed_config(path: Path, config: RunConfig, changed: RunConfig) -> RunConfig:
     """The changed config of a run that goes on; raises ``ValueError`` if it touches what was already learned from."""
-    fixed = [name for name in changed_fields(config, changed) if name.split(".")[0] not in RESUMABLE]
+    changes = changed_fields(config, changed)
+    fixed = [name for name in changes if name not in RESUMABLE and name.split(".")[0] not in RESUMABLE]
     if fixed:
         raise ValueError(
             f"--resume {path}: {', '.join(fixed)} cannot change in a run that has begun; "

@@ -235,9 +235,10 @@ class Learner:
 
 
 def learning_hash(config: RunConfig) -> str:
-    """Names what a checkpoint depends on: all but budgets and places, which may change on resuming."""
+    """Names what a checkpoint depends on: all but budgets, places, rates and temperature, which a resume may change."""
     own = (config.ddpg,) if config.algorithm == "ddpg" else ()
-    return config_hash(config.variant, config.seed, config.env, config.obs, config.encoder, config.sac, *own)
+    sac = dataclasses.replace(config.sac, temperature=1.0, temperature_mode="fixed")
+    return config_hash(config.variant, config.seed, config.env, config.obs, config.encoder, sac, *own)
 
 
 def build_rl(config: RunConfig, encoder: AgentEncoder, action_dim: int, device: torch.device) -> RlLearner:

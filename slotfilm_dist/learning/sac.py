@@ -20,6 +20,7 @@ Departures:
 """
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -200,6 +201,13 @@ class SacLearner(OffPolicyLearner[Actor]):
             "policy_optimiser": self._policy_optimiser,
             "temperature_optimiser": self._temperature_optimiser,
         }
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state; a fixed temperature is the config's, which may have changed on resuming."""
+        super().load(state)
+        if self.config.sac.temperature_mode == "fixed":
+            with torch.no_grad():
+                self.log_temperature.fill_(math.log(self.config.sac.temperature))
 
     def _loose_tensors(self) -> dict[str, Tensor]:
         return {"log_temperature": self.log_temperature}
