@@ -54,7 +54,7 @@ def quick() -> RunConfig:
         base,
         env=replace(base.env, max_steps=200),
         pretrain=replace(base.pretrain, steps=1_500, eval_every=100),
-        schedule=replace(base.schedule, total_steps=10_000, random_steps=4_000, random_episode_steps=32),
+        schedule=replace(base.schedule, total_steps=14_000, random_steps=4_000, random_episode_steps=32),
         replay=replace(base.replay, capacity=20_000, min_steps=1_000),
         evaluation=replace(base.evaluation, episodes=6, every_steps=0, videos=1),
         checkpoint=replace(base.checkpoint, every_updates=1_000),
