@@ -12,6 +12,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("commands.train:main", "a run from nothing to its report, or on with --resume"),
     "scale": ("commands.scale:main", "more or fewer workers for a run that is under way on Ray"),
     "evaluate": ("commands.evaluate:main", "episodes on held-out seeds: trained agent, expert or random policy"),
+    "watch": ("commands.watch:main", "the metrics of a run, live in a terminal"),
     "report": ("commands.report:main", "write the page of a run"),
     "variants": ("commands.listing:variants", "the agents of the study, the tasks, the presets"),
     "cost": ("commands.listing:cost", "parameters, latency and memory of every variant"),

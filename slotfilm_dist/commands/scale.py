@@ -1,6 +1,7 @@
 """`slotfilm scale`: more or fewer workers for a run that is under way."""
 
 import json
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -38,6 +39,7 @@ def main(arguments: Sequence[str]) -> int:
     if options.timeout_s < 0:
         raise ValueError(f"--timeout-s {options.timeout_s:g}: must be 0 or more")
 
+    _present_token(Path(options.run))
     from slotfilm_dist.cluster.hub_client import HubClient
     from slotfilm_dist.cluster.session import joined
 
@@ -68,6 +70,17 @@ def main(arguments: Sequence[str]) -> int:
     else:
         print(_sentence(result, reached=reached, waited=options.timeout_s > 0))
     return 0 if reached or options.timeout_s == 0 else 1
+
+
+def _present_token(run: Path) -> None:
+    """Show the private cluster's token; Ray reads how to authenticate when it is imported, so this comes before."""
+    try:
+        values = json.loads((run / "cluster.json").read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError):
+        return  # `joined` says what is wrong with it
+    if isinstance(values, dict) and values.get("token_path"):
+        os.environ["RAY_AUTH_MODE"] = "token"
+        os.environ["RAY_AUTH_TOKEN_PATH"] = str(values["token_path"])
 
 
 def _steps_per_s(hub: "HubClient") -> float:
