@@ -38,6 +38,8 @@ def main(arguments: Sequence[str]) -> int:
     from slotfilm_dist.runs import new_run_directory
 
     if options.resume:
+        if options.variant or options.name:
+            raise ValueError(f"--resume {options.resume}: leave --variant and --name away; the run has its own")
         path = Path(options.resume)
         config = _resumed_config(path, fields)
     else:

@@ -99,9 +99,7 @@ class WristEnv:
         """
         if len(seeds) != self.num_envs:
             raise ValueError(f"seeds: got {len(seeds)} for {self.num_envs} environments")
-        self._env.reset(
-            seed=list(seeds) if self.num_envs > 1 else int(seeds[0]), options={"reconfigure": self._moved}
-        )
+        self._env.reset(seed=list(seeds) if self.num_envs > 1 else int(seeds[0]), options={"reconfigure": self._moved})
         if self._moved:
             self._attach()
         self._elapsed[:] = 0

@@ -32,7 +32,9 @@ def config_of(task: str = "PickBanana-v1", seed: int = 0) -> RunConfig:
         schedule=replace(config.schedule, total_steps=160, random_steps=60),
         replay=replace(config.replay, min_steps=40),
         evaluation=replace(config.evaluation, episodes=1, videos=0),
-        runtime=replace(config.runtime, mode="local", device="cpu", learner_threads=1, block_steps=8, exact_resume=True),
+        runtime=replace(
+            config.runtime, mode="local", device="cpu", learner_threads=1, block_steps=8, exact_resume=True
+        ),
     )
 
 

@@ -138,7 +138,9 @@ def test_phases_come_in_order_and_leave_a_report(tmp_path: Path) -> None:
     ]
     assert page.is_file()
     assert (tmp_path / "run" / "evaluation" / "final.json").is_file()
-    assert RunDirectory(tmp_path / "run", load_config(tmp_path / "run" / "config.json")).read_status()["phase"] == "done"
+    assert (
+        RunDirectory(tmp_path / "run", load_config(tmp_path / "run" / "config.json")).read_status()["phase"] == "done"
+    )
 
 
 def test_second_run_takes_the_data_that_are_there_and_a_finished_run_only_evaluates(tmp_path: Path) -> None:
