@@ -31,8 +31,9 @@ class Session:
     """A connection to Ray; closing it ends a private cluster and removes its files.
 
     With `RAY_ADDRESS` set, as inside a Ray job, or where Ray is connected already, as inside a Tune trial, that cluster
-    is used and left running. Otherwise a private one is started: loopback only, without a dashboard or usage reports,
-    with a token of its own (unless `RAY_AUTH_MODE` says otherwise) in a folder that nobody else can read.
+    is used and left running. Otherwise a private one is started, without a dashboard or usage reports, with a token of
+    its own (unless `RAY_AUTH_MODE` says otherwise) in a folder that nobody else can read. Ray may still listen on the
+    machine's own address: the token, not the address, keeps others out.
 
     Args:
         num_cpus: cores of a private cluster; 0 takes all that may be used.
