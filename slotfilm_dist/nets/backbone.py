@@ -22,8 +22,8 @@ FEATURE_CHANNELS = 256
 STRIDE = 16
 """Pixels of the picture per cell of the feature map, along each side."""
 
-_IMAGENET_MEAN = (0.485, 0.456, 0.406)
-_IMAGENET_STD = (0.229, 0.224, 0.225)
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
 _UNUSED_PREFIXES = ("layer4.", "fc.")
 _COUNTER = "num_batches_tracked"
 
@@ -51,9 +51,9 @@ class Backbone(nn.Module):
             elif isinstance(module, nn.BatchNorm2d):
                 module.reset_parameters()
         self.trunk.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
-        std = torch.tensor(_IMAGENET_STD).view(1, 3, 1, 1)
+        std = torch.tensor(IMAGENET_STD).view(1, 3, 1, 1)
         self.register_buffer("scale", 1.0 / (255.0 * std), persistent=False)
-        self.register_buffer("shift", -torch.tensor(_IMAGENET_MEAN).view(1, 3, 1, 1) / std, persistent=False)
+        self.register_buffer("shift", -torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1) / std, persistent=False)
 
     def forward(self, rgb: UInt8[Tensor, "batch height width 3"]) -> Float[Tensor, "batch tokens channels"]:
         """The feature map, cell by cell, row by row; the picture is normalised here and nowhere else."""

@@ -1,8 +1,5 @@
 """The state-guided slot encoder: perception, optional goal, state fusion (Section 4; 2,829,390 parameters)."""
 
-from collections.abc import Mapping
-
-import numpy as np
 import torch
 from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor, nn
@@ -10,15 +7,15 @@ from torch import Tensor, nn
 from slotfilm_dist.config import EncoderConfig, ObsConfig
 from slotfilm_dist.nets.backbone import load_initial_weights, weights_hash
 from slotfilm_dist.nets.fusion import StateFusion
+from slotfilm_dist.nets.hand_over import HandedOver
 from slotfilm_dist.nets.interface import VisualKind
 from slotfilm_dist.nets.perception import Perception, PerceptionNetwork
 
 _BACKBONE_PREFIXES = ("perception.backbone.", "perception.projection.")
 _HEAD_PREFIXES = ("perception.uv_head.", "perception.vis_head.")
-_SMALLEST_STD = 1e-6
 
 
-class SlotFusionEncoder(nn.Module):
+class SlotFusionEncoder(HandedOver):
     """Latent of pictures (or their tokens), state and goal; see `interface.Encoder`.
 
     Args:
@@ -32,9 +29,6 @@ class SlotFusionEncoder(nn.Module):
         ValueError: the backbone's weights cannot be had.
     """
 
-    proprio_mean: Tensor
-    proprio_std: Tensor
-
     def __init__(
         self,
         encoder: EncoderConfig,
@@ -44,7 +38,7 @@ class SlotFusionEncoder(nn.Module):
         seed: int = 0,
         fetch_weights: bool = True,
     ) -> None:
-        super().__init__()
+        super().__init__(obs.state_dim)
         generator = torch.Generator().manual_seed(seed)
         self.config = encoder
         self.perception: PerceptionNetwork | None = None
@@ -58,8 +52,6 @@ class SlotFusionEncoder(nn.Module):
             if fetch_weights:
                 load_initial_weights(self.perception.backbone, encoder)
         self._latent_dim = self.fusion.latent_dim if self.fusion else obs.state_dim
-        self.register_buffer("proprio_mean", torch.zeros(obs.state_dim))
-        self.register_buffer("proprio_std", torch.ones(obs.state_dim))
 
     @property
     def visual_kind(self) -> VisualKind:
@@ -105,7 +97,7 @@ class SlotFusionEncoder(nn.Module):
             proprio: the state, in its own units.
             goal: its projection u, v in image units and 1 if in view, else 0; ignored without `encoder.goal`.
         """
-        state = (proprio - self.proprio_mean) / self.proprio_std
+        state = self.standardise(proprio)
         if self.perception is None or self.fusion is None:
             return state
         tokens = self.tokens(visual) if visual.dtype == torch.uint8 else visual.float()
@@ -127,13 +119,6 @@ class SlotFusionEncoder(nn.Module):
         bias = torch.where(in_view, 0.0, self.config.goal_out_of_view_bias)
         shares = (gate_logits + torch.cat((torch.zeros_like(bias), bias), dim=1)).softmax(1)
         return shares[:, :1] * pooled + shares[:, 1:] * perception.goal_feature(tokens, goal[:, :2])
-
-    @torch.no_grad()
-    def set_state_statistics(self, mean: Float[Tensor, " proprio"], std: Float[Tensor, " proprio"]) -> None:
-        """Standardise the state from now on; a dimension that never varied is only centred."""
-        assert mean.shape == std.shape == self.proprio_mean.shape
-        self.proprio_mean.copy_(mean)
-        self.proprio_std.copy_(torch.where(std > _SMALLEST_STD, std, 1.0))
 
     def freeze_backbone(self) -> None:
         """Fix backbone and projection; from now on the encoder works on tokens and BatchNorm stays in eval mode."""
@@ -164,28 +149,8 @@ class SlotFusionEncoder(nn.Module):
         made_by = [(name, value) for name, value in state.items() if name.startswith(_BACKBONE_PREFIXES)]
         return weights_hash(made_by) if made_by else ""
 
-    def acting_state(self) -> dict[str, np.ndarray]:
-        """Copies of what RL changes and acting needs: fusion, gate, state statistics; the backbone unless frozen."""
-        return {name: value.cpu().numpy().copy() for name, value in self._acting_tensors().items()}
-
-    @torch.no_grad()
-    def load_acting_state(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Take over an `acting_state`.
-
-        Raises:
-            ValueError: it belongs to another encoder.
-        """
-        own = self._acting_tensors()
-        if odd := sorted(own.keys() ^ arrays.keys()):
-            raise ValueError(f"weights of another encoder: {odd[0]!r} is in only one of them; compare the two configs")
-        for name, value in own.items():
-            if value.shape != arrays[name].shape:
-                raise ValueError(
-                    f"weights of another encoder: {name} is {arrays[name].shape}, here {tuple(value.shape)}"
-                )
-            value.copy_(torch.from_numpy(np.array(arrays[name])))
-
     def _acting_tensors(self) -> dict[str, Tensor]:
+        """Fusion, gate and state statistics; the backbone unless frozen; the heads never act."""
         unused = _HEAD_PREFIXES + (_BACKBONE_PREFIXES if self.visual_kind == "tokens" else ())
         return {name: value for name, value in self.state_dict().items() if not name.startswith(unused)}
 

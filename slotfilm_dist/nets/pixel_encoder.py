@@ -25,24 +25,21 @@ Departures from the published encoders:
   proposed agent.
 """
 
-from collections.abc import Mapping
-
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor, nn
 
 from slotfilm_dist.config import EncoderConfig, ObsConfig
+from slotfilm_dist.nets.hand_over import HandedOver
 from slotfilm_dist.nets.initialization import orthogonal_conv, orthogonal_linear
 from slotfilm_dist.nets.interface import VisualKind
 
 _KERNEL = 3
 _STRIDES = {"cnn": (2, 2, 2, 2), "drq": (2, 1, 1, 1), "drqv2": (2, 1, 1, 1)}
-_SMALLEST_STD = 1e-6
 
 
-class PixelEncoder(nn.Module):
+class PixelEncoder(HandedOver):
     """Latent of pictures and, with `encoder.fusion = concat_late`, of the state; see `interface.Encoder`.
 
     Args:
@@ -52,11 +49,8 @@ class PixelEncoder(nn.Module):
         seed: of every weight.
     """
 
-    proprio_mean: Tensor
-    proprio_std: Tensor
-
     def __init__(self, encoder: EncoderConfig, obs: ObsConfig, image_size: int, *, seed: int = 0) -> None:
-        super().__init__()
+        super().__init__(obs.state_dim)
         assert encoder.learns_from_pixels, "the slots have an encoder of their own"
         generator = torch.Generator().manual_seed(seed)
         self.config = encoder
@@ -76,8 +70,6 @@ class PixelEncoder(nn.Module):
         """Size of the latent's part that comes from the picture."""
         self.state_dim = obs.state_dim if encoder.uses_state else 0
         """Size of the latent's part that is the state."""
-        self.register_buffer("proprio_mean", torch.zeros(obs.state_dim))
-        self.register_buffer("proprio_std", torch.ones(obs.state_dim))
 
     @property
     def visual_kind(self) -> VisualKind:
@@ -118,13 +110,7 @@ class PixelEncoder(nn.Module):
             latent = torch.tanh(self.norm(latent))
         if self.state_dim == 0:
             return latent
-        return torch.cat((latent, (proprio - self.proprio_mean) / self.proprio_std), dim=1)
-
-    @torch.no_grad()
-    def set_state_statistics(self, mean: Float[Tensor, " proprio"], std: Float[Tensor, " proprio"]) -> None:
-        """Standardise the state from now on; a dimension that never varied is only centred."""
-        self.proprio_mean.copy_(mean)
-        self.proprio_std.copy_(torch.where(std > _SMALLEST_STD, std, 1.0))
+        return torch.cat((latent, self.standardise(proprio)), dim=1)
 
     def freeze_backbone(self) -> None:
         """Nothing: no part of it is fixed in RL."""
@@ -148,24 +134,3 @@ class PixelEncoder(nn.Module):
     def backbone_hash(self) -> str:
         """Empty: replay holds pictures, which belong to no weights."""
         return ""
-
-    def acting_state(self) -> dict[str, np.ndarray]:
-        """Copies of every weight and of the state's statistics."""
-        return {name: value.cpu().numpy().copy() for name, value in self.state_dict().items()}
-
-    @torch.no_grad()
-    def load_acting_state(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Take over an `acting_state`.
-
-        Raises:
-            ValueError: it belongs to another encoder.
-        """
-        own = self.state_dict()
-        if odd := sorted(own.keys() ^ arrays.keys()):
-            raise ValueError(f"weights of another encoder: {odd[0]!r} is in only one of them; compare the two configs")
-        for name, value in own.items():
-            if value.shape != arrays[name].shape:
-                raise ValueError(
-                    f"weights of another encoder: {name} is {arrays[name].shape}, here {tuple(value.shape)}"
-                )
-            value.copy_(torch.from_numpy(np.array(arrays[name])))
