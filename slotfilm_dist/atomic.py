@@ -29,6 +29,10 @@ class FileDigest:
     sha256: str
     """SHA-256 of the content, 64 hex digits."""
 
+    def __post_init__(self) -> None:
+        if type(self.num_bytes) is not int or self.num_bytes < 0 or type(self.sha256) is not str:
+            raise ValueError(f"num_bytes = {self.num_bytes!r}, sha256 = {self.sha256!r}: is no size and hash of a file")
+
 
 def write_atomic(path: Path, chunks: Iterable[bytes | memoryview]) -> FileDigest:
     """Write a file in one indivisible step and return its digest.

@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
+from slotfilm_dist.dashboards import dashboard_urls, probe_dashboard
 from slotfilm_dist.envs.vulkan_probe import VulkanProbe, probe_vulkan, software_driver
 from slotfilm_dist.machine import GIB, usable_cores, usable_memory_bytes
 
@@ -40,7 +41,7 @@ class Check:
     name: str
     """What was looked at."""
     status: Status
-    """`ok`; `warn`: the quick preset runs, something else is missing; `fail`: the quick preset cannot run."""
+    """`ok`; `warn`: the quick preset runs, something else is missing; `fail`: it cannot run, or must not yet."""
     found: str
     """What is there."""
     fix: str = ""
@@ -76,12 +77,14 @@ def collect_checks() -> list[Check]:
         probe = pool.submit(probe_best_driver)
         gpu = pool.submit(check_gpu)
         ray = pool.submit(check_ray)
+        dashboards = pool.submit(lambda: check_dashboards(dashboard_urls(os.environ.get("RAY_ADDRESS", ""))))
         return [
             check_python(sys.version_info[:3]),
             check_packages(),
             check_vulkan(*probe.result()),
             gpu.result(),
             ray.result(),
+            dashboards.result(),
             check_cores(usable_cores()),
             check_memory(usable_memory_bytes() / GIB),
             check_disk(Path.cwd()),
@@ -223,6 +226,21 @@ def check_ray() -> Check:
         return Check(name="Ray", status="ok", found=found)
     fix = "make setup, or go on without it: --runtime.mode local"
     return Check(name="Ray", status="fail", found=f"Ray cannot be imported: {found}", fix=fix)
+
+
+def check_dashboards(urls: Sequence[str]) -> Check:
+    """A Ray dashboard that answers without a token lets everybody who reaches it run code on the cluster."""
+    states = {url: probe_dashboard(url) for url in urls}
+    open_urls = [url for url, state in states.items() if state == "open"]
+    if open_urls:
+        found = f"{' and '.join(open_urls)} answers without a token: whoever reaches it can run code on the cluster"
+        fix = (
+            "stop that cluster and start it with a token: ray get-auth-token --generate; RAY_AUTH_MODE=token ray start "
+            "--head --dashboard-host=127.0.0.1 (ops/security.md)"
+        )
+        return Check(name="Ray dashboard", status="fail", found=found, fix=fix)
+    closed = [url for url, state in states.items() if state == "closed"]
+    return Check(name="Ray dashboard", status="ok", found=f"{closed[0]} asks for a token" if closed else "none is open")
 
 
 def check_cores(cores: float) -> Check:

@@ -18,11 +18,13 @@ MAX_DEPTH = 32
 MAX_AXES = 16
 """Axes of an array."""
 
-_ARRAY_CODE = 1
-_DTYPES = tuple(
+DTYPES = tuple(
     np.dtype(name).newbyteorder("<")
     for name in ("bool", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
 )
+"""Types of an array's elements."""
+
+_ARRAY_CODE = 1
 _MAX_ELEMENTS = 1 << 40
 
 _FIXED_BYTES = {0xC0: 0, 0xC2: 0, 0xC3: 0, 0xCA: 4, 0xCB: 8} | {
@@ -83,19 +85,19 @@ def _plain(value: Any, depth: int) -> Any:
 
 def _encode_array(array: np.ndarray) -> msgpack.ExtType:
     little = array.dtype.newbyteorder("<")
-    if little not in _DTYPES:
+    if little not in DTYPES:
         raise ValueError(f"cannot be written: an array of {array.dtype}")
     if array.ndim > MAX_AXES:
         raise ValueError(f"cannot be written: an array of {array.ndim} axes; at most {MAX_AXES}")
-    header = struct.pack(f"<BB{array.ndim}Q", _DTYPES.index(little), array.ndim, *array.shape)
+    header = struct.pack(f"<BB{array.ndim}Q", DTYPES.index(little), array.ndim, *array.shape)
     return msgpack.ExtType(_ARRAY_CODE, header + array.astype(little, copy=False).tobytes())
 
 
 def _decode_array(_code: int, payload: bytes) -> np.ndarray:
     dtype_index, num_axes = struct.unpack_from("<BB", payload)
-    if dtype_index >= len(_DTYPES) or num_axes > MAX_AXES:
+    if dtype_index >= len(DTYPES) or num_axes > MAX_AXES:
         raise ValueError("an array of unknown type")
-    dtype = _DTYPES[dtype_index]
+    dtype = DTYPES[dtype_index]
     shape: tuple[int, ...] = struct.unpack_from(f"<{num_axes}Q", payload, 2)
     start = 2 + 8 * num_axes
     if math.prod(max(length, 1) for length in shape) > _MAX_ELEMENTS:

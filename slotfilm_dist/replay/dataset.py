@@ -1,7 +1,7 @@
 """The random policy's frames as a directory of columns, read through memory maps and shared by many trials."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,10 @@ MANIFEST = "manifest.json"
 PROGRESS = "progress.json"
 FORMAT = 1
 """Version of the layout on disk."""
+HEADER_BYTES = 256
+"""Size of a column's `.npy` header."""
+
+_LARGEST_MANIFEST = 1 << 20
 
 EPISODE_COLUMN = Column(shape=(), dtype=np.dtype(np.int32))
 DATASET_WORKER_ID = -1
@@ -118,22 +122,33 @@ def open_dataset(directory: Path, expect_hash: str, *, verify: bool = True) -> F
         ValueError: it does not exist, is unfinished, altered, or made with another config; names the file and the fix.
     """
     manifest = _read_manifest(directory)
-    if manifest["config_hash"] != expect_hash:
+    if manifest.get("config_hash") != expect_hash:
         raise ValueError(
-            f"{directory} was made with config {manifest['config_hash']}, this run needs {expect_hash}; "
+            f"{directory} was made with config {manifest.get('config_hash')}, this run needs {expect_hash}; "
             "collect a dataset of its own for this run"
         )
-    schema = from_dict(ReplaySchema, manifest["schema"], "schema.")
+    try:
+        schema = from_dict(ReplaySchema, manifest["schema"], "schema.")
+        counts = {name: manifest[name] for name in ("num_rows", "num_steps", "num_episodes")}
+        for name, count in counts.items():
+            check(type(count) is int and 0 <= count < 1 << 48, name, count, "must be a number of rows")
+        columns = dataset_columns(schema)
+        digests = {name: FileDigest(**manifest["files"][f"{name}.npy"]) for name in columns}
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        raise ValueError(
+            f"{directory / MANIFEST} is corrupt: {error}; delete the directory and collect again"
+        ) from None
     arrays: dict[str, Any] = {}
-    for name, column in dataset_columns(schema).items():
+    for name, column in columns.items():
         path = directory / f"{name}.npy"
-        check_file(path, FileDigest(**manifest["files"][path.name]), content=verify)
-        arrays[name] = _open_column(path, column, manifest["num_rows"])
+        check_file(path, digests[name], content=verify)
+        arrays[name] = _open_column(path, column, counts["num_rows"])
+    _check_rows(directory, arrays, counts)
     return FrameDataset(
         schema=schema,
-        config_hash=manifest["config_hash"],
-        num_steps=manifest["num_steps"],
-        num_episodes=manifest["num_episodes"],
+        config_hash=expect_hash,
+        num_steps=counts["num_steps"],
+        num_episodes=counts["num_episodes"],
         **arrays,
     )
 
@@ -141,12 +156,14 @@ def open_dataset(directory: Path, expect_hash: str, *, verify: bool = True) -> F
 def _read_manifest(directory: Path) -> dict[str, Any]:
     path = directory / MANIFEST
     try:
+        if path.stat().st_size > _LARGEST_MANIFEST:
+            raise ValueError("it is too large")
         manifest = json.loads(path.read_bytes())
     except FileNotFoundError:
         if (directory / PROGRESS).exists():
             raise ValueError(f"{directory} is an unfinished dataset; collect again to continue it") from None
         raise ValueError(f"{path} does not exist: {directory} is not a dataset") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is corrupt: {error}; delete the directory and collect again") from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ValueError(f"{path} is not a manifest of format {FORMAT}; delete the directory and collect again")
@@ -157,7 +174,25 @@ def _open_column(path: Path, column: Column, num_rows: int) -> np.ndarray:
     shape = (num_rows, *column.shape)
     if 0 in shape:
         return np.empty(shape, column.dtype)  # an empty file cannot be mapped
-    array = np.load(path, mmap_mode="r", allow_pickle=False)
-    if array.shape != shape or array.dtype != column.dtype:
-        raise ValueError(f"{path} holds {array.dtype} {array.shape}, the manifest says {column.dtype} {shape}")
-    return array
+    # The header is compared and not read: only one is right, and numpy's reader of headers can fail in many ways.
+    with path.open("rb") as file:
+        header = file.read(HEADER_BYTES)
+    if header != npy_header(column, num_rows) or path.stat().st_size != HEADER_BYTES + num_rows * column.num_bytes:
+        raise ValueError(f"{path} does not hold {column.dtype} {shape}, as the manifest says; collect again")
+    return np.memmap(path, column.dtype, "r", offset=HEADER_BYTES, shape=shape)
+
+
+def npy_header(column: Column, num_rows: int) -> bytes:
+    """A version 1.0 `.npy` header of a fixed size, so that the number of rows can be filled in at the end."""
+    fields = {"descr": column.dtype.str, "fortran_order": False, "shape": (num_rows, *column.shape)}
+    prefix = b"\x93NUMPY\x01\x00" + (HEADER_BYTES - 10).to_bytes(2, "little")
+    return prefix + repr(fields).encode("latin1").ljust(HEADER_BYTES - 11) + b"\n"
+
+
+def _check_rows(directory: Path, arrays: Mapping[str, np.ndarray], counts: Mapping[str, int]) -> None:
+    """Raise ``ValueError`` where the columns and the manifest's numbers contradict each other."""
+    is_step, episode = arrays["is_step"], arrays["episode"]
+    if counts["num_rows"] == 0 or bool(is_step[-1]) or int(np.count_nonzero(is_step)) != counts["num_steps"]:
+        raise ValueError(f"{directory} is corrupt: its steps are not those that the manifest counts; collect again")
+    if episode.min() < 0 or episode.max() >= counts["num_episodes"]:
+        raise ValueError(f"{directory} is corrupt: its episodes are not those that the manifest counts; collect again")

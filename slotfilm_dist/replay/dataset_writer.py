@@ -13,10 +13,8 @@ import numpy as np
 from slotfilm_dist.atomic import file_digest, write_atomic
 from slotfilm_dist.config import check, to_dict
 from slotfilm_dist.messages import TransitionBlock
-from slotfilm_dist.replay.dataset import FORMAT, MANIFEST, PROGRESS, dataset_columns
+from slotfilm_dist.replay.dataset import FORMAT, HEADER_BYTES, MANIFEST, PROGRESS, dataset_columns, npy_header
 from slotfilm_dist.replay.schema import Column, ReplaySchema
-
-_HEADER_BYTES = 256
 
 
 class FrameDatasetWriter:
@@ -87,7 +85,7 @@ class FrameDatasetWriter:
         check(self.num_rows > 0, "num_rows", 0, "a dataset needs at least one block")
         for name, column in self._columns.items():
             self._files[name].seek(0)
-            self._files[name].write(_npy_header(column, self.num_rows))
+            self._files[name].write(npy_header(column, self.num_rows))
         self._commit()
         self.close()
         manifest: dict[str, Any] = {
@@ -115,23 +113,26 @@ class FrameDatasetWriter:
         try:
             progress = json.loads(path.read_bytes())
             identity, counts = progress["identity"], progress["counts"]
-        except (ValueError, KeyError, TypeError) as error:
+            rows, steps, episodes = counts["rows"], counts["steps"], counts["episodes"]
+            for count in (rows, steps, episodes):
+                check(type(count) is int and 0 <= count < 1 << 48, "counts", count, "must be a number of rows")
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise ValueError(f"{path} is corrupt ({error!r}); delete {self._directory} and collect again") from None
         if identity != self._identity:
             raise ValueError(
                 f"{self._directory} is an unfinished dataset of another config or schema "
                 f"({identity} instead of {self._identity}); delete it or choose another directory"
             )
-        return counts["rows"], counts["steps"], counts["episodes"]
+        return rows, steps, episodes
 
     def _open_column(self, name: str, column: Column) -> BinaryIO:
         path = self._directory / f"{name}.npy"
-        size = _HEADER_BYTES + self.num_rows * column.num_bytes
+        size = HEADER_BYTES + self.num_rows * column.num_bytes
         if self.num_rows and (not path.exists() or path.stat().st_size < size):
             raise ValueError(f"{path} is shorter than {PROGRESS} says; delete {self._directory} and collect again")
         path.touch()
         file = path.open("r+b")
-        file.write(_npy_header(column, 0))
+        file.write(npy_header(column, 0))
         file.truncate(size)
         file.seek(size)
         return file
@@ -180,10 +181,3 @@ def _frame_key(block: TransitionBlock, row: int) -> tuple[int, int, bytes]:
     for column in (block.visual, block.proprio, block.goal):
         digest.update(column[row].tobytes())
     return block.worker_id, block.incarnation, digest.digest()
-
-
-def _npy_header(column: Column, num_rows: int) -> bytes:
-    """A version 1.0 `.npy` header of a fixed size, so that the number of rows can be filled in at the end."""
-    fields = {"descr": column.dtype.str, "fortran_order": False, "shape": (num_rows, *column.shape)}
-    prefix = b"\x93NUMPY\x01\x00" + (_HEADER_BYTES - 10).to_bytes(2, "little")
-    return prefix + repr(fields).encode("latin1").ljust(_HEADER_BYTES - 11) + b"\n"

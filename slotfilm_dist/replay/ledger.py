@@ -124,6 +124,11 @@ class BlockLedger:
             state["num_shards"],
             f"replay has {self.num_shards} shards now; resume with the number it was saved with",
         )
+        for name, width in (("logs", 3), ("early", 3), ("forgotten", 2)):
+            rows = state[name]
+            ok = isinstance(rows, np.ndarray) and rows.dtype == np.int64 and rows.ndim == 2 and rows.shape[1] == width
+            check(ok, f"ledger.{name}", type(rows).__name__, f"must be rows of {width} whole numbers")
+        check(type(state["num_given_up"]) is int, "ledger.num_given_up", state["num_given_up"], "must be a number")
         self._logs = {}
         for worker, incarnation, mark in state["logs"].tolist():
             self._logs.setdefault(worker, {})[incarnation] = _Log(mark=mark)

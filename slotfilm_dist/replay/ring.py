@@ -206,7 +206,11 @@ class RowRing:
         for name in ("capacity_steps", "num_rows"):
             mine, saved = getattr(self, name), state[name]
             check(saved == mine, f"ring.{name}", saved, f"this ring has {mine}; resume with the replay size it had")
-        next_row, first_step, next_step = state["next_row"], state["first_step"], state["next_step"]
+        for name, total in ((field.name, state["drawn"][field.name]) for field in fields(SampleTotals)):
+            check(type(total) is int, f"ring.drawn.{name}", total, "must be a whole number")
+        next_row, first_step, next_step = (
+            whole_number(state, name, "ring.") for name in ("next_row", "first_step", "next_step")
+        )
         check(0 <= first_step <= next_step <= next_row, "ring.next_step", next_step, "the counters contradict another")
         check(next_step - first_step <= self.capacity_steps, "ring.first_step", first_step, "holds more than fits")
         used_rows, used_steps = min(next_row, self.num_rows), min(next_step, self.capacity_steps)
@@ -219,6 +223,12 @@ class RowRing:
         ascending = bool((np.diff(stored) > 0).all())
         inside = bool((stored >= max(0, next_row - self.num_rows)).all() and (stored < next_row - 1).all())
         check(ascending and inside, "ring.step_rows", len(stored), "step rows out of order or outside the ring")
+
+
+def whole_number(state: Mapping[str, Any], name: str, where: str = "") -> int:
+    """A saved counter; raises ``ValueError`` if it is no whole number from 0 on."""
+    check(type(state[name]) is int and state[name] >= 0, where + name, state[name], "must be a whole number, 0 or more")
+    return state[name]
 
 
 def ring_rows(capacity_steps: int, block_steps: int) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from slotfilm_dist.config import changed_fields, check, from_dict, to_dict
 from slotfilm_dist.messages import SampleBatch, TransitionBlock
 from slotfilm_dist.replay.ledger import BlockLedger
-from slotfilm_dist.replay.ring import RowRing, SampleTotals
+from slotfilm_dist.replay.ring import RowRing, SampleTotals, whole_number
 from slotfilm_dist.replay.schema import ReplaySchema
 
 
@@ -145,26 +145,29 @@ class ReplayShard:
             raise ValueError(
                 f"the saved shard lacks {error}; it is not a shard's state or of another version"
             ) from None
+        except (TypeError, AttributeError, IndexError, OverflowError) as error:
+            raise ValueError(f"the saved shard is damaged: {error}") from None
 
     def _load(self, state: Mapping[str, Any]) -> None:
         differing = changed_fields(self.schema, from_dict(ReplaySchema, state["schema"], "schema."))
         if differing:
             name, (mine, saved) = next(iter(differing.items()))
             check(False, f"schema.{name}", saved, f"this replay has {mine!r}; its data cannot be taken over")
-        rng = _generator(state["rng"])
+        rng = generator_from(state["rng"])
         ledger = BlockLedger(self._ledger.index, self._ledger.num_shards)
         ledger.load(state["ledger"])
-        totals = state["inserted_steps"], state["inserted_blocks"], state["duplicate_blocks"]
+        totals = tuple(whole_number(state, name) for name in ("inserted_steps", "inserted_blocks", "duplicate_blocks"))
         self._ring.load(state["ring"])
         self._ledger = ledger
         self._rng = rng
         self._inserted_steps, self._inserted_blocks, self._duplicate_blocks = totals
 
 
-def _generator(state: str) -> np.random.Generator:
+def generator_from(state: Any) -> np.random.Generator:
+    """A random stream that goes on from its saved state, JSON; raises ``ValueError`` if it is none."""
     rng = np.random.default_rng(0)
     try:
         rng.bit_generator.state = json.loads(state)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise ValueError(f"rng: not the state of a random stream: {error}") from None
     return rng

@@ -12,7 +12,7 @@ from jaxtyping import Int64
 from slotfilm_dist.config import check
 from slotfilm_dist.messages import SampleBatch, TransitionBlock
 from slotfilm_dist.replay.ledger import shard_of
-from slotfilm_dist.replay.shard import ReplayShard
+from slotfilm_dist.replay.shard import ReplayShard, generator_from
 
 
 def split_draws(
@@ -90,8 +90,12 @@ class ShardedReplay:
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Take over a saved state; raises ``ValueError`` if it does not fit."""
-        saved = state["shards"]
-        check(len(saved) == len(self._shards), "shards", len(saved), f"this replay has {len(self._shards)}")
-        for index, shard in enumerate(self._shards):
-            shard.load(saved[f"shard{index}"])
-        self._rng.bit_generator.state = json.loads(state["rng"])
+        names = [f"shard{index}" for index in range(len(self._shards))]
+        saved = state.get("shards")
+        if not isinstance(saved, Mapping):
+            raise ValueError(f"shards: is {type(saved).__name__}, must hold the state of every shard")
+        check(set(saved) == set(names), "shards", len(saved), f"this replay has {len(self._shards)}")
+        rng = generator_from(state.get("rng"))
+        for name, shard in zip(names, self._shards, strict=True):
+            shard.load(saved[name])
+        self._rng = rng

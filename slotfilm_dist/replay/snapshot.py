@@ -6,6 +6,7 @@ their SHA-256. The manifest is renamed into place last; until then the old one a
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,8 @@ import numpy as np
 
 from slotfilm_dist.atomic import TEMPORARY_SUFFIX, FileDigest, check_file, write_atomic
 from slotfilm_dist.config import check, to_dict
-from slotfilm_dist.replay.codec import decode, encode
+from slotfilm_dist.replay.codec import DTYPES, decode, encode
+from slotfilm_dist.replay.schema import Column
 
 MANIFEST = "manifest.json"
 FORMAT = 1
@@ -22,6 +24,9 @@ FORMAT = 1
 
 LARGE_BYTES = 1 << 16
 """Arrays from this size on get a file of their own."""
+
+LARGEST_REST = 1 << 28
+"""Bytes that everything but the large arrays may take, and the manifest; a real one takes a few hundred kilobytes."""
 
 _CHUNK_BYTES = 1 << 23
 _PREFIX = "replay-"
@@ -71,16 +76,25 @@ def read_snapshot(directory: Path) -> dict[str, Any]:
         ValueError: there is none, or a file is missing, cut short or altered; names the file.
     """
     manifest = _read_manifest(directory)
-    for name, digest in manifest["files"].items():
-        check_file(directory / name, FileDigest(**digest))
+    files, arrays = _check_manifest(directory, manifest)
+    for name, digest in files.items():
+        check_file(directory / name, digest)
     prefix = f"{_PREFIX}{manifest['generation']}"
-    state = decode((directory / f"{prefix}.msgpack").read_bytes())
-    for path, array in manifest["arrays"].items():
-        *parents, leaf = path.split(".")
-        owner = state
-        for parent in parents:
-            owner = owner[parent]
-        owner[leaf] = np.memmap(directory / f"{prefix}-{path}.bin", array["dtype"], "r", shape=tuple(array["shape"]))
+    path = directory / f"{prefix}.msgpack"
+    try:
+        state = decode(path.read_bytes())
+        for name, column in arrays.items():
+            *parents, leaf = name.split(".")
+            owner = state
+            for parent in parents:
+                owner = owner[parent] if isinstance(owner, dict) else None
+            if not isinstance(owner, dict) or leaf in owner:
+                raise ValueError(f"there is no place for the array {name}")
+            owner[leaf] = np.memmap(directory / f"{prefix}-{name}.bin", column.dtype, "r", shape=column.shape)
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is corrupt: {error}") from None
+    if not isinstance(state, dict):
+        raise ValueError(f"{path} is corrupt: it holds no mapping")
     return state
 
 
@@ -114,12 +128,16 @@ def _signed(manifest: dict[str, Any]) -> bytes:
 def _read_manifest(directory: Path) -> dict[str, Any]:
     path = directory / MANIFEST
     try:
+        if path.stat().st_size > LARGEST_REST:
+            raise ValueError("it is too large")
         content = json.loads(path.read_bytes())
         manifest, expected = content["manifest"], content["sha256"]
     except FileNotFoundError:
         raise ValueError(f"{path} is missing: {directory} holds no finished replay snapshot") from None
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{path} is corrupt: {error!r}") from None
+    if not isinstance(manifest, dict) or not manifest.keys() >= {"format", "generation", "files", "arrays"}:
+        raise ValueError(f"{path} is corrupt: fields are missing")
     if hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest() != expected:
         raise ValueError(f"{path} is corrupt: its SHA-256 differs from the one it states")
     if manifest["format"] != FORMAT:
@@ -127,13 +145,47 @@ def _read_manifest(directory: Path) -> dict[str, Any]:
     return manifest
 
 
+def _check_manifest(directory: Path, manifest: Mapping[str, Any]) -> tuple[dict[str, FileDigest], dict[str, Column]]:
+    """What the manifest says of each file and each array; raises ``ValueError`` unless one fits the other exactly."""
+    path, generation = directory / MANIFEST, manifest["generation"]
+    try:
+        check(type(generation) is int and 0 < generation < 1 << 63, "generation", generation, "must be a number")
+        files = {name: FileDigest(**digest) for name, digest in manifest["files"].items()}
+        arrays = {name: _column(name, described) for name, described in manifest["arrays"].items()}
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        raise ValueError(f"{path} is corrupt: {error}") from None
+    rest = f"{_PREFIX}{generation}.msgpack"
+    sizes = {f"{_PREFIX}{generation}-{name}.bin": column.num_bytes for name, column in arrays.items()}
+    if files.keys() != {rest, *sizes}:
+        raise ValueError(f"{path} is corrupt: its files and its arrays differ")
+    for name, num_bytes in sizes.items():
+        if files[name].num_bytes != num_bytes:
+            raise ValueError(f"{path} is corrupt: {name} has not the size of its array")
+    if not files[rest].num_bytes <= LARGEST_REST:
+        raise ValueError(f"{path} is corrupt: {rest} is too large")
+    return files, arrays
+
+
+def _column(name: str, described: Mapping[str, Any]) -> Column:
+    shape = described["shape"]
+    check(all(part.isidentifier() for part in name.split(".")), "arrays", name, "must be identifiers and dots")
+    check(described["dtype"] in DTYPES, f"arrays.{name}.dtype", described["dtype"], "must be a plain number's type")
+    check(
+        isinstance(shape, list) and all(type(n) is int and 0 < n < 1 << 48 for n in shape),
+        *(f"arrays.{name}.shape", shape, "must be a list of sizes"),
+    )
+    check(math.prod(shape) < 1 << 48, f"arrays.{name}.shape", shape, "is impossible")
+    return Column(shape=tuple(shape), dtype=np.dtype(described["dtype"]))
+
+
 def _previous(directory: Path) -> tuple[int, set[str]]:
     """Generation and files of the last snapshot; one that cannot be read is not worth keeping."""
     try:
         manifest = _read_manifest(directory)
+        files, _ = _check_manifest(directory, manifest)
     except ValueError:
         return 0, set()
-    return manifest["generation"], set(manifest["files"])
+    return manifest["generation"], set(files)
 
 
 def _remove_files(directory: Path, kept: set[str]) -> None:

@@ -1,13 +1,19 @@
 """The doctor's verdicts, on situations made here and on this machine's own Python."""
 
+import contextlib
 import resource
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
 
+from slotfilm_dist.dashboards import dashboard_urls
 from slotfilm_dist.doctor import (
     Check,
     check_cores,
+    check_dashboards,
     check_disk,
     check_imagenet,
     check_memory,
@@ -153,3 +159,76 @@ def test_the_table_keeps_a_long_fix_on_one_line(capsys: pytest.CaptureFixture[st
     lines = capsys.readouterr().out.splitlines()
     assert any(fix in line for line in lines)
     assert "cannot run yet: 1" in "".join(lines)
+
+
+@contextlib.contextmanager
+def dashboard(status: int, body: bytes) -> Iterator[str]:
+    """Something on the loopback that answers as a dashboard does; gives its address."""
+
+    class Answer(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(status if self.path == "/api/jobs/" and "Authorization" not in self.headers else 500)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *arguments: object) -> None:
+            """Keep the terminal clean."""
+
+    with HTTPServer(("127.0.0.1", 0), Answer) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_dashboard_without_a_token_stops_the_main_job_and_says_how_to_close_it() -> None:
+    with dashboard(200, b"[]") as open_url, dashboard(401, b"Unauthorized") as closed_url:
+        check = check_dashboards([closed_url, open_url])
+    assert not is_ready([check])
+    assert open_url in check.found
+    assert closed_url not in check.found
+    assert "RAY_AUTH_MODE=token" in check.fix
+
+
+@pytest.mark.parametrize(
+    ("status", "body", "found"),
+    [
+        (401, b"Unauthorized", "asks for a token"),
+        (403, b"", "asks for a token"),
+        (404, b"", "none"),
+        (200, b"<p>", "none"),
+    ],
+)
+def test_dashboard_with_a_token_or_another_server_is_no_danger(status: int, body: bytes, found: str) -> None:
+    with dashboard(status, body) as url:
+        check = check_dashboards([url])
+    assert check.status == "ok"
+    assert found in check.found
+
+
+def test_no_dashboard_is_no_danger() -> None:
+    assert check_dashboards(["http://127.0.0.1:1"]).found == "none is open"
+
+
+@pytest.mark.parametrize(
+    ("address", "url"),
+    [
+        ("10.0.0.7:6379", "http://10.0.0.7:8265"),
+        ("ray://head:10001", "http://head:8265"),
+        ("http://head:9000/", "http://head:9000"),
+        ("[::1]:6379", "http://[::1]:8265"),
+    ],
+)
+def test_dashboard_is_looked_for_where_ray_address_points(address: str, url: str) -> None:
+    assert dashboard_urls(address)[-1] == url
+    assert dashboard_urls(address)[0] == "http://127.0.0.1:8265"
+
+
+@pytest.mark.parametrize("address", ["", "auto", "local"])
+def test_without_an_address_only_this_machine_is_looked_at(address: str) -> None:
+    assert all(url.endswith(":8265") for url in dashboard_urls(address))
+    assert len(dashboard_urls(address)) <= 2

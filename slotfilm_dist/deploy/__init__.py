@@ -1,0 +1,1 @@
+"""Taking a trained policy to where neither the simulator nor Ray is installed."""
