@@ -4,6 +4,7 @@ import dataclasses
 import json
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
@@ -38,30 +39,53 @@ def variants(arguments: Sequence[str]) -> int:
 
 
 def cost(arguments: Sequence[str]) -> int:
-    """Parameters, latency and memory of every variant (Table A3)."""
+    """Parameters, latency and memory of every variant (Table A3), and the machine (Table A2)."""
     parser = Parser(
-        prog="slotfilm cost", description="Parameters, batch-1 latency and memory of the variants (Table A3)."
+        prog="slotfilm cost", description="Parameters, batch-1 latency and memory of the variants (Tables A2 and A3)."
     )
     parser.add_argument("--only", nargs="*", default=list(VARIANTS), help="variants to measure (default: all)")
     parser.add_argument(
         "--device", choices=("auto", "cpu", "cuda"), default="auto", help="where (default: %(default)s)"
     )
+    parser.add_argument("--out", metavar="DIR", help="also write cost.csv, cost.json and machine.json there")
     parser.add_argument("--json", action="store_true", help="print a list of JSON objects")
     options = parser.parse_args(arguments)
+    if not options.only:
+        raise ValueError("--only: name at least one variant")
     configs = [apply_variant(name, PRESETS["paper"]()) for name in options.only]
 
-    from slotfilm_dist.evaluation.cost import cost_of
+    from slotfilm_dist.evaluation.cost import costs_of
+    from slotfilm_dist.local import learner_device
 
-    rows = []
-    for config in configs:
-        placed = dataclasses.replace(
+    placed = [
+        dataclasses.replace(
             config,
             encoder=dataclasses.replace(config.encoder, backbone="random"),
             runtime=dataclasses.replace(config.runtime, device=options.device),
         )
-        rows.append(dataclasses.asdict(cost_of(placed)))
+        for config in configs
+    ]
+    device = learner_device(placed[0])
+    rows = []
+    for row in costs_of(placed, device):
+        print(f"{row.variant}: {row.latency_ms_mean:.2f} ms on {row.device}", file=sys.stderr)
+        rows.append(dataclasses.asdict(row))
+    if options.out:
+        _write_costs(Path(options.out), rows)
     _print(rows, list(rows[0]), as_json=options.json)
     return 0
+
+
+def _write_costs(folder: Path, rows: list[dict]) -> None:
+    """The table, and the machine that it was measured on."""
+    import torch
+
+    from slotfilm_dist.evaluation.result_files import write_csv, write_json
+    from slotfilm_dist.runs import describe_machine
+
+    write_csv(folder / "cost.csv", rows)
+    write_json(folder / "cost.json", rows)
+    write_json(folder / "machine.json", describe_machine() | {"cuda": torch.version.cuda or "none"})
 
 
 def _print(rows: list[dict], head: list[str], *, as_json: bool) -> None:

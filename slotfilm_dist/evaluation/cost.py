@@ -1,9 +1,13 @@
 """Parameters, latency and memory of an agent (Table A3)."""
 
+import multiprocessing
 import resource
 import sys
 import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -35,13 +39,27 @@ class CostRow:
     """Actions a second at the mean latency."""
     peak_memory_mb: float
     """Most memory used, in MB: torch's allocations on a GPU, the whole process (libraries too) on a CPU."""
+    model_memory_mb: float
+    """That without what was in use before the agent was built: the agent's weights and what a pass needs, in MB."""
     device: str
     """What it was measured on."""
 
 
+def costs_of(configs: Sequence[RunConfig], device: torch.device | str) -> Iterator[CostRow]:
+    """The rows of several agents, each measured in a fresh process, so that none finds another's memory there."""
+    for config in configs:
+        with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
+            yield process.submit(cost_of, config, str(device)).result()
+
+
 def cost_of(config: RunConfig, device: torch.device | str = "cpu", action_dim: int = _ACTION_DIM) -> CostRow:
-    """Count and time one agent, on the device and with the torch threads as they are set."""
+    """Count and time one agent, on the device and with the torch threads as they are set.
+
+    Latency is averaged over 100 passes of batch size one that follow 10 others (Appendix A.3). The memory of a process
+    that has measured before holds the largest agent so far: use `costs_of` for more than one.
+    """
     device = torch.device(device)
+    before = _memory_bytes(device)
     generator = torch.Generator().manual_seed(config.seed)
     encoder = build_encoder(config, fetch_weights=False)
     if not config.sac.end_to_end:
@@ -53,6 +71,7 @@ def cost_of(config: RunConfig, device: torch.device | str = "cpu", action_dim: i
         torch.cuda.reset_peak_memory_stats(device)
     times_ms = _time_passes(encoder, actor, config, device)
     mean = float(times_ms.mean())
+    peak = _peak_memory_bytes(device)
     encoder_params, actor_params = count_params(encoder), count_params(actor)
     return CostRow(
         variant=config.variant,
@@ -62,7 +81,8 @@ def cost_of(config: RunConfig, device: torch.device | str = "cpu", action_dim: i
         latency_ms_mean=mean,
         latency_ms_std=float(times_ms.std(ddof=1)),
         rate_hz=1000.0 / mean,
-        peak_memory_mb=_peak_memory_bytes(device) / 1e6,
+        peak_memory_mb=peak / 1e6,
+        model_memory_mb=(peak - before) / 1e6,
         device=_device_name(device),
     )
 
@@ -89,11 +109,33 @@ def _time_passes(encoder: AgentEncoder, actor: AgentActor, config: RunConfig, de
     return np.array(times_ms[_WARM_UP_PASSES:])
 
 
+def _memory_bytes(device: torch.device) -> int:
+    """Memory in use now; 0 where the system does not tell."""
+    if device.type == "cuda":
+        return torch.cuda.memory_allocated(device)
+    return _process_memory_bytes("VmRSS") or 0
+
+
 def _peak_memory_bytes(device: torch.device) -> int:
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
+    peak = _process_memory_bytes("VmHWM")
+    if peak is not None:
+        return peak
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+def _process_memory_bytes(field: str) -> int | None:
+    """A field of Linux's account of this process; None on other systems.
+
+    `ru_maxrss` would not do: a child process begins with its parent's.
+    """
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith(field + ":")), None)
 
 
 def _device_name(device: torch.device) -> str:
