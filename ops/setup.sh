@@ -95,6 +95,22 @@ install_project() {
   say "the dependencies are installed"
 }
 
+# Install packages without starting their services, now or with the machine: prometheus listens on every address.
+install_without_services() {
+  local policy=/usr/sbin/policy-rc.d made="" status=0 package
+  if [ ! -e "$policy" ]; then
+    printf '#!/bin/sh\nexit 101\n' | as_root tee "$policy" >/dev/null
+    as_root chmod 755 "$policy"
+    made=1
+  fi
+  apt_install "$@" || status=$?
+  if [ -n "$made" ]; then as_root rm -f "$policy"; fi
+  for package in "$@"; do
+    if [ -e "/etc/init.d/$package" ]; then as_root update-rc.d "$package" disable >/dev/null 2>&1 || true; fi
+  done
+  return "$status"
+}
+
 install_test_programs() {
   local program package missing=()
   while read -r program package; do
@@ -102,7 +118,7 @@ install_test_programs() {
     command -v "$program" >/dev/null || missing+=("$package")
   done <ops/test-packages.txt
   [ ${#missing[@]} -gt 0 ] || return 0
-  if may_install && apt_update && apt_install "${missing[@]}"; then
+  if may_install && apt_update && install_without_services "${missing[@]}"; then
     say "installed for the tests: ${missing[*]}"
   else
     say "the tests that need ${missing[*]} will be skipped: these packages could not be installed"

@@ -1,0 +1,178 @@
+"""A run on the toy environment, watched by a real Prometheus with the project's own configuration."""
+
+import itertools
+import json
+import math
+import os
+import shutil
+import socket
+import subprocess
+import time
+import urllib.error
+import urllib.parse
+import urllib.request
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from slotfilm_dist.cluster.backend import RayBackend
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.envs.toy import make_toy_env
+from slotfilm_dist.pipeline import Pipeline, StopFlag
+from slotfilm_dist.presets import smoke
+from slotfilm_dist.progress import Progress
+from slotfilm_dist.runs import RunDirectory
+from slotfilm_dist.variants import apply_variant
+
+OPS = Path(__file__).parents[2] / "ops"
+REPORT_INTERVAL = "RAY_metrics_report_interval_ms"
+"""How often Ray's processes report their metrics to the agent that Prometheus asks; Ray spells it like this."""
+START_S = 30.0
+"""Longest wait for Prometheus to answer."""
+Series = dict[tuple[tuple[str, str], ...], list[float]]
+"""Values over time by labels."""
+
+
+class Prometheus:
+    """A Prometheus of its own on a loopback port; scrapes and evaluates the project's rules every second.
+
+    Args:
+        folder: for its data, its configuration, and Ray's list of endpoints.
+        idle_port: where a run outside Ray would serve; nobody does.
+    """
+
+    def __init__(self, folder: Path, idle_port: int) -> None:
+        self.discovery = folder / "prom_metrics_service_discovery.json"
+        self.port = free_port()
+        config = yaml.safe_load((OPS / "prometheus.yml").read_text())
+        config["global"] = {"scrape_interval": "1s", "scrape_timeout": "1s", "evaluation_interval": "1s"}
+        config["rule_files"] = [str(OPS / "prometheus" / "rules" / "*.yml")]
+        ray, slotfilm = config["scrape_configs"]
+        ray["file_sd_configs"] = [{"files": [str(self.discovery)], "refresh_interval": "1s"}]
+        slotfilm["static_configs"] = [{"targets": [f"127.0.0.1:{idle_port}"]}]
+        (folder / "prometheus.yml").write_text(yaml.safe_dump(config))
+        self._log = (folder / "prometheus.log").open("wb")
+        self._process = subprocess.Popen(
+            [
+                "prometheus",
+                f"--config.file={folder / 'prometheus.yml'}",
+                f"--storage.tsdb.path={folder / 'tsdb'}",
+                f"--web.listen-address=127.0.0.1:{self.port}",
+            ],
+            stdout=self._log,
+            stderr=subprocess.STDOUT,
+        )
+        self._await_answer(folder / "prometheus.log")
+
+    def get(self, path: str, **parameters: object) -> Any:
+        """What its HTTP API answers; raises ``ValueError`` with its words when it refuses."""
+        query = urllib.parse.urlencode(parameters)
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{self.port}/api/v1/{path}?{query}", timeout=20) as answer:
+                return json.load(answer)["data"]
+        except urllib.error.HTTPError as error:
+            raise ValueError(f"{parameters}: {error.read().decode()}") from None
+
+    def over_time(self, query: str, start: float, end: float) -> Series:
+        """Values of a query from start to end, one a second."""
+        answer = self.get("query_range", query=query, start=start, end=end, step="1s")
+        return {
+            tuple(sorted(one["metric"].items())): [float(value) for _, value in one["values"]]
+            for one in answer["result"]
+        }
+
+    def close(self) -> None:
+        """End it."""
+        self._process.terminate()
+        self._process.wait(30)
+        self._log.close()
+
+    def _await_answer(self, log: Path) -> None:
+        deadline = time.monotonic() + START_S
+        while time.monotonic() < deadline and self._process.poll() is None:
+            try:
+                self.get("status/buildinfo")
+                return
+            except (OSError, ValueError):  # it answers 503 while it starts
+                time.sleep(0.1)
+        self._process.kill()
+        raise AssertionError(f"Prometheus does not answer:\n{log.read_text()[-3000:]}")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class WatchedRun:
+    """A run that has ended, and what was seen of it."""
+
+    config: RunConfig
+    prometheus: Prometheus
+    start: float
+    end: float
+
+    def values(self, query: str) -> Series:
+        """Values of a query during the run."""
+        return self.prometheus.over_time(query, self.start, self.end)
+
+    def without_data(self, queries: Iterable[str]) -> list[str]:
+        """Those of the queries that gave not one finite value."""
+        return [q for q in queries if not any(map(math.isfinite, itertools.chain(*self.values(q).values())))]
+
+
+def free_port() -> int:
+    """A loopback port that nobody uses now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def watched_config(metrics_port: int) -> RunConfig:
+    """Every phase once, with an evaluation and several checkpoints in between, on as few processes as that takes."""
+    base = apply_variant("slotfilm", smoke())
+    schedule = replace(base.schedule, total_steps=440, random_steps=200, updates_per_step=0.5)
+    runtime = replace(base.runtime, mode="ray", num_workers=1, block_steps=16, learner_threads=1, device="cpu")
+    return replace(
+        base,
+        env=replace(base.env, max_steps=20),
+        pretrain=replace(base.pretrain, steps=10),
+        schedule=schedule,
+        evaluation=replace(base.evaluation, episodes=1, every_steps=150, during_episodes=1, videos=0),
+        checkpoint=replace(base.checkpoint, every_updates=30),
+        runtime=replace(runtime, metrics_port=metrics_port),
+    )
+
+
+@pytest.fixture(scope="session")
+def watched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WatchedRun]:
+    if shutil.which("prometheus") is None:
+        pytest.skip("needs the programs of ops/test-packages.txt: bash ops/setup.sh --test")
+    folder = tmp_path_factory.mktemp("watched")
+    config = watched_config(free_port())
+    prometheus = Prometheus(folder, free_port())
+    os.environ[REPORT_INTERVAL] = "2000"  # milliseconds; 10 s otherwise
+    try:
+        start = time.time()
+        with RunDirectory(folder / "watched", config) as run:
+            backend = RayBackend(config, run.path, make_toy_env)
+            try:
+                backend.prepare()
+                list_ray_endpoints(prometheus.discovery)
+                Pipeline(run, backend, folder / "artifacts", Progress(), StopFlag()).execute()
+            finally:
+                backend.close()
+        yield WatchedRun(config=config, prometheus=prometheus, start=start, end=time.time())
+    finally:
+        del os.environ[REPORT_INTERVAL]
+        prometheus.close()
+
+
+def list_ray_endpoints(path: Path) -> None:
+    """What the dashboard of a head writes; a private cluster has none."""
+    import ray
+    from ray._private.metrics_agent import PrometheusServiceDiscoveryWriter
+
+    writer = PrometheusServiceDiscoveryWriter(ray.get_runtime_context().gcs_address, str(path.parent))
+    writer.write()
+    assert Path(writer.get_target_file_name()) == path
