@@ -1,13 +1,14 @@
 # Every target works from a fresh clone: those that need the virtual environment make it first.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check doctor clean distclean
+.PHONY: help setup demo test test-all check doctor bench bench-peers clean distclean
 
 PYTEST_ARGS ?=
+BENCH_ARGS ?=
 
 help: ## Show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
-	@echo '  Variables: PYTHON, PIP_EXTRA_ARGS (set-up), PYTEST_ARGS (test)'
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@echo '  Variables: PYTHON, PIP_EXTRA_ARGS (set-up), PYTEST_ARGS (test), BENCH_ARGS (bench)'
 
 setup: ## Make .venv with all dependencies, and a Vulkan driver where there is none
 	@bash ops/setup.sh
@@ -33,9 +34,19 @@ check: setup ## Check format, lint, types, and unit tests with branch coverage
 doctor: setup ## Show what this machine can do, with a fix for each lack
 	@.venv/bin/slotfilm doctor
 
+bench: setup ## Measure speed as ratios against what one would pick instead
+	@.venv/bin/slotfilm bench $(BENCH_ARGS)
+
+bench-peers: setup ## Install what `make bench` compares with apart, into .peers
+	@.venv/bin/python -m venv .peers
+	@site=$$(.venv/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))'); \
+	peers=$$(.peers/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))'); \
+	echo "import site; site.addsitedir('$$site')" > "$$peers/project.pth"
+	@.peers/bin/python -m pip install --no-input $(PIP_EXTRA_ARGS) -r slotfilm_dist/bench/peers/requirements.txt
+
 clean: ## Remove caches and build outputs; runs and artifacts stay
 	@rm -rf build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .coverage .coverage.* htmlcov
 	@find . -path ./.venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 
-distclean: clean ## Also remove .venv
-	@rm -rf .venv
+distclean: clean ## Also remove .venv and .peers
+	@rm -rf .venv .peers

@@ -1,0 +1,42 @@
+"""Training from end to end at one update a step, rendering on: against Stable-Baselines3 and RLlib."""
+
+from slotfilm_dist.bench.contender import Contender, ContenderError, missing
+from slotfilm_dist.bench.results import BenchOptions, BenchResult, at_least
+from slotfilm_dist.bench.rounds import interleave
+
+STORED = 200
+"""Steps collected before the first update."""
+WHAT = (
+    "env steps/s of PickBanana-v1 with the wrist camera's 128 x 128 picture (render profile wrist for both), one SAC "
+    "update of batch 128 and hidden 256 x 256 a step, one thread each; "
+)
+PEERS = (
+    ("Stable-Baselines3 SAC", "peers.sb3_training", 1, 200.0, "our encoder on pictures, backbone frozen"),
+    ("RLlib SAC", "peers.rllib_training", 3, 5.0, "its own CNN, four convolutions of 32 channels, without the state"),
+)
+"""Name, script, steps a round, goal, and what it runs."""
+
+
+def run(options: BenchOptions) -> list[BenchResult]:
+    """Our loop in one process against each peer's."""
+    rows: list[BenchResult] = []
+    for peer, module, steps, goal, text in PEERS:
+        name = f"e2e/against {peer}"
+        try:
+            with (
+                Contender(module, {"stored": STORED}, peer=True) as theirs,
+                Contender("own_training", {"stored": STORED}) as ours,
+            ):
+                rounds = interleave(
+                    {
+                        "ours": lambda child=ours: child.ask(num_steps=options.scaled(128)),
+                        peer: lambda child=theirs, n=steps: child.ask(num_steps=n),
+                    },
+                    options.rounds,
+                )
+        except ContenderError as error:
+            rows.append(missing(name, goal, "times", error))
+            continue
+        how = f"{WHAT}ours on stored tokens, {peer} with {text}: {rounds.describe('ours', peer, 'steps/s')}"
+        rows.append(at_least(name, rounds.ratio("ours", peer).median, goal, "times", how))
+    return rows

@@ -1,0 +1,1 @@
+"""Scripts that run what ours is compared with, each in a child process; `serving` is what they answer through."""
