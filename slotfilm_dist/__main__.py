@@ -10,12 +10,18 @@ from slotfilm_dist import __version__
 COMMANDS: dict[str, tuple[str, str]] = {
     "doctor": ("commands.doctor:main", "what this machine can do, and a fix for each lack"),
     "train": ("commands.train:main", "a run from nothing to its report, or on with --resume"),
+    "grid": ("commands.grid:main", "every variant and seed of the study as trials; the same command goes on"),
     "scale": ("commands.scale:main", "more or fewer workers for a run that is under way on Ray"),
     "evaluate": ("commands.evaluate:main", "episodes on held-out seeds: trained agent, expert or random policy"),
+    "probe": ("commands.probe:main", "what a frozen agent's latent tells linearly: contact, progress (Table 3)"),
+    "perceive": ("commands.perceive:main", "attention, positions and visibility on an image, video, webcam or stream"),
     "watch": ("commands.watch:main", "the metrics of a run, live in a terminal"),
+    "chaos": ("commands.chaos:main", "damage a real run on purpose: what should follow, what does"),
     "report": ("commands.report:main", "write the page of a run"),
+    "export": ("commands.export:main", "the trained policy as files that need neither simulator nor Ray"),
     "variants": ("commands.listing:variants", "the agents of the study, the tasks, the presets"),
     "cost": ("commands.listing:cost", "parameters, latency and memory of every variant"),
+    "bench": ("commands.bench:main", "speed against what one would pick instead, as ratios"),
 }
 
 

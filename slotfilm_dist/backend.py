@@ -11,6 +11,10 @@ Player = Literal["random", "expert", "agent"]
 """Who acts in an evaluation; `agent` is the learner's newest weights, acting deterministically."""
 
 
+class RunFailedError(RuntimeError):
+    """The run cannot go on; the message names the cause and the remedy."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TrainReport:
     """What happened since the last report."""

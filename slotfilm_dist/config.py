@@ -27,11 +27,15 @@ STATE_FIELD_DIMS: dict[str, int] = {
     "object_pose": 7,
     "tcp_to_object": 3,
     "object_to_goal": 3,
+    "object_to_goal_near": 3,
 }
 """Size of each field of the proprioceptive vector; ``object_poses`` counts once per object of the task."""
 
-PRIVILEGED_FIELDS = frozenset({"object_poses", "object_pose", "tcp_to_object", "object_to_goal"})
+PRIVILEGED_FIELDS = frozenset({"object_poses", "object_pose", "tcp_to_object", "object_to_goal", "object_to_goal_near"})
 """Fields that read the simulator's object poses: only the validation variant ``oracle_state`` uses them."""
+
+TEMPERATURE_FIELDS = ("temperature_mode", "temperature", "final_temperature", "annealing_updates")
+"""Fields of `sac` that a resumed run may change."""
 
 PROPRIO_FIELDS = ("qpos", "qvel", "tcp_pose", "tcp_twist", "goal", "is_grasped")
 
@@ -360,10 +364,14 @@ class SacConfig:
     """Transitions per update."""
     reward_scale: float = 10.0
     """Multiplies the reward in the critic's target; scale 10 with temperature 1 equals scale 1 with temperature 0.1."""
-    temperature_mode: Literal["fixed", "auto"] = "fixed"
-    """Keep the temperature, or tune it to `target_entropy`."""
+    temperature_mode: Literal["fixed", "auto", "annealed"] = "fixed"
+    """Keep the temperature, tune it to `target_entropy`, or lower it geometrically to `final_temperature`."""
     temperature: float = 1.0
     """Entropy temperature, or its starting value; the paper names no value."""
+    final_temperature: float = 0.01
+    """Temperature after `annealing_updates`, when `temperature_mode = annealed`."""
+    annealing_updates: int = 500_000
+    """Updates over which the annealed temperature falls."""
     target_entropy: float = -7.0
     """Target entropy of `auto`, in nats; minus the action dimensions by default."""
     log_std_min: float = -5.0
@@ -394,7 +402,7 @@ class SacConfig:
             self.hidden,
             "needs at least one layer, each wider than 0",
         )
-        _positive("sac", self, "batch_size", "reward_scale", "temperature")
+        _positive("sac", self, "batch_size", "reward_scale", "temperature", "final_temperature", "annealing_updates")
         _not_negative("sac", self, "grad_clip", "augment_views")
         _positive("sac", self, "augment_shift_px")
         check(
@@ -520,9 +528,16 @@ class RuntimeConfig:
     mode: Literal["local", "ray"] = "ray"
     """`local` runs every role in one process, bit-reproducibly; `ray` spreads them over processes and machines."""
     num_workers: int = 2
-    """Environment workers (`ray` mode)."""
+    """Environment workers (`ray` mode); with `auto_workers` those to begin with."""
+    auto_workers: bool = False
+    """Add workers while the learner starves and cores are free, remove them while they wait (`ray` mode)."""
+    max_workers: int = 0
+    """Most workers that `auto_workers` asks for; 0 is as many as the cluster has cores."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device of the learner; `auto` takes a GPU where there is one."""
+    inference: Literal["auto", "worker", "central"] = "auto"
+    """Who turns pictures into actions (`ray` mode): every worker for itself, or one process for all workers, in
+    batches; `auto` is central where that process gets a GPU and the agent has a camera."""
     learner_threads: int = 0
     """Torch threads of the learner on a CPU; 0 takes half of the cores."""
     worker_threads: int = 1
@@ -535,11 +550,18 @@ class RuntimeConfig:
     """Build the simulator anew for every training episode (`local` mode; half a second each): a resumed run then equals
     an uninterrupted one bit for bit. Without it PhysX's last digits depend on the episodes before."""
     metrics_port: int = 9464
-    """Loopback port where Prometheus finds the run's metrics; 0 opens none. A taken port is stepped over."""
+    """Port where Prometheus finds the run's metrics, 0 for none: on loopback in `local` mode, of Ray's own agent in a
+    cluster that the run starts. A taken port is stepped over."""
 
     def __post_init__(self) -> None:
         _positive("runtime", self, "num_workers", "worker_threads", "block_steps", "publish_every")
-        _not_negative("runtime", self, "learner_threads")
+        _not_negative("runtime", self, "learner_threads", "max_workers")
+        check(
+            self.max_workers == 0 or self.max_workers >= self.num_workers,
+            "runtime.max_workers",
+            self.max_workers,
+            f"must be 0 or at least runtime.num_workers = {self.num_workers}",
+        )
         check(0 <= self.metrics_port < 65536, "runtime.metrics_port", self.metrics_port, "must lie in [0, 65535]")
 
 
@@ -553,6 +575,8 @@ class CheckpointConfig:
     """Checkpoints kept beside `best`."""
     save_replay: bool = True
     """Also write the replay buffer at the end and on Ctrl-C, so that a resumed run continues with its data."""
+    strict: bool = False
+    """Stop where the newest checkpoint is damaged instead of going back to the one before."""
 
     def __post_init__(self) -> None:
         _positive("checkpoint", self, "every_updates", "keep")
@@ -670,6 +694,9 @@ def from_dict(cls: type[ConfigT], values: dict[str, Any], where: str = "") -> Co
             near = difflib.get_close_matches(key, known, n=1)
             raise ValueError(f"unknown field {path!r}" + (f"; did you mean {where + near[0]!r}?" if near else ""))
         kwargs[key] = _coerce(hints[key], value, path)
+    lacking = [n for n, f in known.items() if n not in kwargs and f.default is f.default_factory is dataclasses.MISSING]
+    if lacking:
+        raise ValueError(f"field {where + lacking[0]!r} is missing")
     return cls(**kwargs)
 
 
@@ -686,6 +713,7 @@ def _coerce(kind: Any, value: Any, path: str) -> Any:
         check(isinstance(value, list | tuple), path, value, "must be a list")
         return tuple(_coerce(typing.get_args(kind)[0], item, path) for item in value)
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        check(abs(value) < 1 << 1023, path, "a number of hundreds of digits", "must be a number of sensible size")
         return float(value)
     check(
         isinstance(value, kind) and (kind is bool or not isinstance(value, bool)),
@@ -707,7 +735,7 @@ def load_config(path: Path) -> RunConfig:
         values = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ValueError(f"{path} does not exist; a run directory has a config.json") from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not valid JSON: {error}") from None
     if not isinstance(values, dict):
         raise ValueError(f"{path} is no config: it must hold one JSON object of sections")

@@ -8,6 +8,7 @@ One loop takes turns: collect a block, make the updates that the limiter owes fo
 running episode, where the simulator's state follows from a seed, so that a resumed run continues exactly.
 """
 
+import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -15,17 +16,20 @@ from typing import Any
 
 import torch
 
-from slotfilm_dist.backend import Player, TrainReport
+from slotfilm_dist.backend import Player, RunFailedError, TrainReport
 from slotfilm_dist.config import RunConfig
-from slotfilm_dist.envs.expert import ExpertPolicy
-from slotfilm_dist.envs.wrist_env import WristEnv
-from slotfilm_dist.evaluation.rollouts import Recorder, Watch, play_episodes
+from slotfilm_dist.evaluation.rollouts import Recorder
 from slotfilm_dist.evaluation.video import write_film_strip, write_video
 from slotfilm_dist.learning.checkpoint import CheckpointStore, read_checkpoint, write_checkpoint
 from slotfilm_dist.learning.learner import Learner, dataset_hash, learning_hash
+from slotfilm_dist.learning.off_policy import TrainingDivergedError
+from slotfilm_dist.learning.recovery import Recovery
+from slotfilm_dist.local_envs import LocalEnv, LocalEnvs, make_wrist_env
 from slotfilm_dist.machine import usable_cores, usable_memory_bytes
-from slotfilm_dist.messages import EpisodeSummary, TransitionBlock
-from slotfilm_dist.policy import AgentPolicy, Policy, RandomPolicy
+from slotfilm_dist.messages import EpisodeSummary, SampleBatch, TransitionBlock
+from slotfilm_dist.nets.agent import build_encoder
+from slotfilm_dist.policy import AgentPolicy, RandomPolicy
+from slotfilm_dist.rejection import BrokenEnvironmentError
 from slotfilm_dist.replay.dataset import open_dataset
 from slotfilm_dist.replay.limiter import RateLimiter
 from slotfilm_dist.replay.memory import check_memory
@@ -41,6 +45,8 @@ PRETRAIN_SAVE_S = 60.0
 """Seconds between checkpoints of an unfinished pre-training."""
 REPORT_S = 1.0
 """Seconds between reports of training."""
+
+_logger = logging.getLogger(__name__)
 
 
 def learner_device(config: RunConfig) -> torch.device:
@@ -58,14 +64,15 @@ class LocalBackend:
 
     Args:
         config: the run.
+        make_env: builds an environment, with a camera or without.
     """
 
-    def __init__(self, config: RunConfig) -> None:
+    def __init__(self, config: RunConfig, make_env: Callable[[RunConfig, bool], LocalEnv] = make_wrist_env) -> None:
         self._config = config
         self._device = learner_device(config)
         self._use_threads(all_cores=False)
-        self._training_env: WristEnv | None = None
-        self._playing_env: WristEnv | None = None
+        self._envs = LocalEnvs(config, make_env)
+        self._rejected_before = self._cut_before = 0
         self._learner: Learner | None = None
 
     def prepare(self) -> None:
@@ -75,40 +82,47 @@ class LocalBackend:
             ValueError: something is missing; says what and how to mend it.
         """
         check_memory(self._config, usable_memory_bytes())
-        self._env  # noqa: B018  built here
         if self._config.encoder.uses_image and self._config.encoder.backbone != "random":
-            Learner(self._config, self.action_dim, torch.device("cpu"))
+            build_encoder(self._config, fetch_weights=True)
+        self._envs.training  # noqa: B018  built here
 
     @property
     def action_dim(self) -> int:
         """Size of the action."""
-        return self._any_env.action_dim
+        return self._envs.any.action_dim
 
     @property
     def reward_term_names(self) -> tuple[str, ...]:
         """Names of the reward's components."""
-        return self._any_env.reward_term_names
+        return self._envs.any.reward_term_names
 
     def random_blocks(self, num_steps: int, start: int) -> Iterator[TransitionBlock]:
         """Blocks of the random policy; a collection continued at step `start` has random streams of its own."""
         seed = self._config.seed
-        policy = RandomPolicy(self.action_dim, role_seed(seed, Role.RANDOM_ACTIONS, incarnation=start))
-        loop = RolloutLoop(
-            self._env, policy, role_seed(seed, Role.RANDOM_EPISODES, incarnation=start), incarnation=start
-        )
-        self._env.episode_steps = self._config.schedule.random_episode_steps or self._config.env.max_steps
-        done = 0
+        steps = self._config.schedule.random_episode_steps or self._config.env.max_steps
+        done = tries = 0
         while done < num_steps:
-            block = loop.collect(min(self._config.runtime.block_steps, num_steps - done))
-            done += block.num_steps
-            yield block
-        self._env.episode_steps = self._config.env.max_steps
+            streams = {"worker": tries, "incarnation": start}
+            policy = RandomPolicy(self.action_dim, role_seed(seed, Role.RANDOM_ACTIONS, **streams))
+            self._envs.training.episode_steps = steps
+            try:
+                loop = RolloutLoop(
+                    self._envs.training, policy, role_seed(seed, Role.RANDOM_EPISODES, **streams), incarnation=start
+                )
+                while done < num_steps:
+                    block = loop.collect(min(self._config.runtime.block_steps, num_steps - done))
+                    done += block.num_steps
+                    yield block
+            except BrokenEnvironmentError as error:
+                self._envs.replace_broken(error)
+                tries += 1
+        self._envs.training.episode_steps = self._config.env.max_steps
 
     def pretrain(self, dataset: Path, artifact: Path) -> Iterator[dict[str, float]]:
         """Pre-train and write the result, continuing what an interrupted pre-training left."""
         self._use_threads(all_cores=True)
         learner = self._learner = Learner(self._config, self.action_dim, self._device)
-        learner.begin_pretraining(open_dataset(dataset, dataset_hash(self._config), verify=False))
+        learner.begin_pretraining(open_dataset(dataset, dataset_hash(self._config)))
         unfinished = artifact.with_name(artifact.name + ".unfinished")
         if unfinished.exists():
             learner.load_pretrain_state(read_checkpoint(unfinished, learner.pretrain_state().config_hash))
@@ -124,23 +138,25 @@ class LocalBackend:
     def begin_training(self, dataset: Path, pretrained: Path | None, resume_from: Path | None) -> dict[str, Any]:
         """Build learner, replay, limiter and rollouts; give back the checkpoint's values."""
         config = self._config
-        found = (
-            CheckpointStore(resume_from, config.checkpoint.keep).read_last(learning_hash(config))
-            if resume_from
-            else None
-        )
+        store = CheckpointStore(resume_from, config.checkpoint.keep) if resume_from else None
+        found = store.read_last(learning_hash(config), strict=config.checkpoint.strict) if store else None
         learner = self._learner = Learner(
             config, self.action_dim, self._device, fetch_weights=not (pretrained or found)
         )
-        data = open_dataset(dataset, dataset_hash(config), verify=False)
+        data = open_dataset(dataset, dataset_hash(config))
         if pretrained is not None:
             learner.load_pretrained(read_checkpoint(pretrained))
         learner.begin_rl(data)
         values: dict[str, Any] = {}
         if found is not None:
-            checkpoint, _ = found
+            checkpoint, problems = found
+            for problem in problems:
+                _logger.warning("an older checkpoint is used: %s", problem)
             learner.load_checkpoint(checkpoint)
             values = checkpoint.values
+        self._recovery = Recovery(learner)
+        if resume_from is not None:
+            self._recovery.use(resume_from)
         self._store = self._build_replay(learner)
         snapshot = resume_from / "replay" if resume_from else None
         if values and snapshot is not None and (snapshot / MANIFEST).exists():
@@ -159,7 +175,7 @@ class LocalBackend:
         self._limiter.try_insert(data.num_steps)
         self._limiter.start_learning(data.num_steps)
         self._policy = AgentPolicy(learner.encoder, learner.rl.actor, role_seed(config.seed, Role.ACTIONS))
-        self._loop = RolloutLoop(self._env, self._policy, role_seed(config.seed, Role.EPISODES))
+        self._loop = RolloutLoop(self._envs.training, self._policy, role_seed(config.seed, Role.EPISODES))
         if values:
             self._limiter.load(values["limiter"])
             if "rollout" in values:  # a checkpoint written on a cluster has neither: its workers draw anew
@@ -189,18 +205,17 @@ class LocalBackend:
         began_steps, began_updates = limiter.env_steps, learner.updates
         while limiter.env_steps < config.schedule.total_steps:
             left = config.schedule.total_steps - limiter.env_steps
-            block = self._loop.collect(min(config.runtime.block_steps, left))
+            block = self._collect(min(config.runtime.block_steps, left))
             self._store.insert(block)
             limiter.try_insert(block.num_steps)
             episodes += [(episode, block.policy_version) for episode in block.episodes]
             for _ in range(limiter.updates_owed()):
-                learner.update(self._store.sample(1, config.sac.batch_size)[0])
-                limiter.try_update(1)
+                self._update(self._store.sample(1, config.sac.batch_size)[0])
             self._policy.version = learner.updates
             now = time.monotonic()
             if now - reported >= REPORT_S:
                 elapsed = now - reported
-                metrics = learner.metrics() | {
+                metrics = self._metrics() | {
                     "worker_env_steps_per_s": (limiter.env_steps - began_steps) / elapsed,
                     "learner_updates_per_s": (learner.updates - began_updates) / elapsed,
                     "replay_stored_steps": self._store.num_steps(),
@@ -211,17 +226,59 @@ class LocalBackend:
                 reported, began_steps, began_updates = time.monotonic(), limiter.env_steps, learner.updates
             if self._loop.at_episode_start and should_stop():
                 break
-        yield self._report(learner.metrics(), episodes)
+        yield self._report(self._metrics(), episodes)
+
+    def _collect(self, num_steps: int) -> TransitionBlock:
+        """A block; an environment that is broken is replaced, and its worker's next incarnation goes on."""
+        while True:
+            try:
+                return self._loop.collect(num_steps)
+            except BrokenEnvironmentError as error:
+                self._envs.replace_broken(error)
+                self._rejected_before += self._loop.num_rejected
+                self._cut_before += self._loop.num_cut_episodes
+                self._loop = RolloutLoop(
+                    self._envs.training,
+                    self._policy,
+                    role_seed(self._config.seed, Role.EPISODES, incarnation=self._loop.incarnation + 1),
+                    incarnation=self._loop.incarnation + 1,
+                )
+
+    def _update(self, batch: SampleBatch) -> None:
+        """One update that is due; what a return to a checkpoint loses is due again."""
+        learner = self._trained()
+        before = learner.updates
+        try:
+            learner.update(batch)
+        except TrainingDivergedError as error:
+            try:
+                lost = self._recovery.roll_back(error)
+            except TrainingDivergedError as final:
+                raise RunFailedError(f"the learner stopped: {final}; go on with --resume") from final
+            _logger.warning("%s; went back by %d updates, with half the rates", error, lost)
+            if lost:
+                self._limiter.refund_update(lost)
+            return
+        if learner.updates > before:
+            self._limiter.try_update(1)
+
+    def _metrics(self) -> dict[str, float]:
+        return self._trained().metrics() | {
+            "learner_rollbacks_total": self._recovery.num_rollbacks,
+            "worker_nonfinite_total": self._rejected_before + self._loop.num_rejected,
+            "worker_cut_episodes_total": self._cut_before + self._loop.num_cut_episodes,
+            "worker_restarts_total/nonfinite": self._envs.num_broken,
+        }
 
     def play(self, player: Player, seeds: Sequence[int]) -> Iterator[EpisodeSummary]:
         """Play episodes in an environment of their own."""
         camera = player == "agent" and self._config.encoder.uses_image
-        yield from self._play(player, seeds, camera=camera)
+        yield from self._envs.play(player, self._agent(player), seeds, camera=camera)
 
     def record(self, player: Player, seed: int, video: Path, film_strip: Path) -> EpisodeSummary:
         """Play one episode with the camera on and write its video and film strip."""
         recorder = Recorder(self._learner.encoder if player == "agent" and self._learner else None)
-        summary = next(self._play(player, [seed], camera=True, watch=recorder))
+        summary = next(self._envs.play(player, self._agent(player), [seed], camera=True, watch=recorder))
         write_video(recorder.frames, video)
         write_film_strip(recorder.frames, film_strip)
         return summary
@@ -235,15 +292,14 @@ class LocalBackend:
         if best:
             return store.write_best(checkpoint)
         size = store.write(checkpoint, learner.updates)
+        self._recovery.use(folder)
         if with_replay:
             write_snapshot(folder / "replay", self._store.view())
         return size
 
     def close(self) -> None:
         """Release the simulators."""
-        for env in (self._training_env, self._playing_env):
-            if env is not None:
-                env.close()
+        self._envs.close()
 
     def _build_replay(self, learner: Learner) -> ShardedReplay:
         config, schema = self._config, learner.schema()
@@ -263,39 +319,12 @@ class LocalBackend:
         ]
         return ShardedReplay(shards, role_seed(config.seed, Role.REPLAY))
 
-    def _play(
-        self, player: Player, seeds: Sequence[int], *, camera: bool, watch: Watch | None = None
-    ) -> Iterator[EpisodeSummary]:
-        env = self._evaluation_env(camera)
-        yield from play_episodes(env, self._player(player, env), seeds, watch)
-
-    @property
-    def _env(self) -> WristEnv:
-        """The environment that training collects in, built at the first need."""
-        if self._training_env is None:
-            self._training_env = WristEnv(self._config, camera=self._config.encoder.uses_image)
-            self._training_env.fresh_episodes = self._config.runtime.exact_resume
-        return self._training_env
-
-    @property
-    def _any_env(self) -> WristEnv:
-        return self._playing_env or self._env
-
-    def _evaluation_env(self, camera: bool) -> WristEnv:
-        """An environment of its own, so that training's is not disturbed; with a camera from its first need on."""
-        if self._playing_env is None or (camera and not self._playing_env.has_camera):
-            if self._playing_env is not None:
-                self._playing_env.close()
-            self._playing_env = WristEnv(self._config, camera=camera)
-        return self._playing_env
-
-    def _player(self, player: Player, env: WristEnv) -> Policy:
-        seed = role_seed(self._config.seed, Role.EVALUATION)
-        if player == "random":
-            return RandomPolicy(self.action_dim, seed)
-        if player == "expert":
-            return ExpertPolicy(env)
+    def _agent(self, player: Player) -> AgentPolicy | None:
+        """The trained agent, deterministic, where it is to play."""
+        if player != "agent":
+            return None
         learner = self._trained()
+        seed = role_seed(self._config.seed, Role.EVALUATION)
         return AgentPolicy(learner.encoder, learner.rl.actor, seed, deterministic=True)
 
     def _use_threads(self, *, all_cores: bool) -> None:

@@ -90,7 +90,8 @@ class TransitionBlock:
     sequence: int
     """Number of this block within the incarnation, from 0; with the two above it makes inserts idempotent."""
     policy_version: int
-    """Version of the weights that acted; the learner reports the age. -1 for the random policy."""
+    """Version of the weights that acted first; newer ones may have taken over within the block. -1 for the random
+    policy. The learner reports the age."""
     backbone_hash: str
     """Hash of the frozen backbone that made the tokens; empty where `visual` holds none."""
     visual: Shaped[np.ndarray, "rows *visual"]

@@ -10,8 +10,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-EXPORT_PREFIX = "slotfilm_"
-"""What Prometheus names begin with."""
+from slotfilm_dist.config import RunConfig
+
+RAY_PREFIX = "ray_"
+"""What Ray's metrics agent puts before every name by itself."""
+EXPORT_PREFIX = RAY_PREFIX + "slotfilm_"
+"""What Prometheus names begin with, inside Ray and outside, so that one rule fits both."""
 
 PHASES = ("collect", "pretrain", "train", "evaluate")
 """Phases of a run in their order; the metric `phase` is an index into them."""
@@ -41,6 +45,8 @@ class Metric:
     """Name of the label that splits the metric, empty without one."""
     label_values: tuple[str, ...] = ()
     """Labels allowed; any word when empty."""
+    by_worker: bool = False
+    """On a cluster every worker's process exports it itself, counted since that process began."""
 
     @property
     def role(self) -> str:
@@ -57,12 +63,14 @@ def _gauge(name: str, unit: str, text: str) -> Metric:
     return Metric(name, unit, "gauge", text)
 
 
-def _counter(name: str, unit: str, text: str, label: str = "", label_values: tuple[str, ...] = ()) -> Metric:
-    return Metric(name, unit, "counter", text, label, label_values)
+def _counter(
+    name: str, unit: str, text: str, label: str = "", label_values: tuple[str, ...] = (), *, by_worker: bool = False
+) -> Metric:
+    return Metric(name, unit, "counter", text, label, label_values, by_worker)
 
 
-def _duration(name: str, text: str) -> Metric:
-    return Metric(name, "s", "histogram", text)
+def _duration(name: str, text: str, *, by_worker: bool = False) -> Metric:
+    return Metric(name, "s", "histogram", text, by_worker=by_worker)
 
 
 _RUN = (
@@ -77,17 +85,15 @@ _RUN = (
 )
 
 _WORKER = (
-    _counter("worker_env_steps_total", "steps", "Environment steps collected by the workers."),
+    _counter("worker_env_steps_total", "steps", "Environment steps collected by the workers.", by_worker=True),
     _gauge("worker_env_steps_per_s", "steps/s", "Environment steps collected a second, all workers together."),
-    _counter("worker_episodes_total", "episodes", "Episodes finished."),
     _counter("worker_cut_episodes_total", "episodes", "Episodes cut short by a restart; left out of every mean."),
-    _counter("worker_blocks_total", "blocks", "Blocks of steps sent to replay."),
+    _counter("worker_blocks_total", "blocks", "Blocks of steps sent to replay.", by_worker=True),
     _gauge("worker_alive_count", "workers", "Workers that are running."),
+    _gauge("worker_wanted_count", "workers", "Workers that should be running."),
     _gauge("worker_least_share", "share", "Share of the steps that the slowest worker collected, times their number."),
-    _duration("worker_sim_s", "Time of one environment step, physics and rendering."),
-    _duration("worker_act_s", "Time to choose the actions of one step, picture to action."),
-    _duration("worker_insert_wait_s", "Time a worker waited until the limiter and replay took its block."),
-    _counter("worker_wait_s_total", "s", "Time the workers have waited for the limiter and replay."),
+    _duration("worker_sim_s", "Time of one environment step, physics and rendering.", by_worker=True),
+    _counter("worker_wait_s_total", "s", "Time the workers have waited for the limiter and replay.", by_worker=True),
     _gauge("worker_wait_share", "share", "Share of the workers' time spent waiting."),
     _counter("worker_nonfinite_total", "steps", "Steps refused for a non-finite reward, state or picture."),
     _counter("worker_restarts_total", "restarts", "Workers replaced, by reason.", "reason", RESTART_REASONS),
@@ -97,15 +103,12 @@ _REPLAY = (
     _gauge("replay_stored_steps", "steps", "Steps stored now, over all shards."),
     _gauge("replay_capacity_steps", "steps", "Steps that fit."),
     _gauge("replay_stored_bytes", "bytes", "Memory held by the stored steps."),
-    _gauge("replay_age_steps", "steps", "Mean age of the stored steps, in environment steps."),
-    _gauge("replay_oldest_age_steps", "steps", "Age of the oldest stored step, in environment steps."),
     _gauge("replay_sample_age_steps", "steps", "Mean age of the sampled steps, in environment steps."),
     _gauge("replay_sample_age_updates", "updates", "Mean age of the policy that collected the sampled steps."),
     _counter("replay_inserted_steps_total", "steps", "Steps ever stored."),
     _counter("replay_sampled_steps_total", "steps", "Steps ever sampled."),
     _counter("replay_duplicate_blocks_total", "blocks", "Blocks refused because they had been stored before."),
     _counter("replay_missing_blocks_total", "blocks", "Gaps in the workers' block numbers."),
-    _counter("replay_refused_blocks_total", "blocks", "Blocks refused for another backbone or shape."),
     _gauge("replay_shards_alive_count", "shards", "Shards that answer."),
     _counter("replay_restarts_total", "restarts", "Shards replaced, by reason.", "reason", RESTART_REASONS),
 )
@@ -121,8 +124,18 @@ _WEIGHTS = (
     _gauge("weights_version", "updates", "Version of the newest published weights."),
     _gauge("weights_age_updates", "updates", "Updates made since the weights that the workers act with."),
     _gauge("weights_age_s", "s", "Time since the weights that the workers act with were published."),
-    _gauge("weights_bytes", "bytes", "Size of one weight snapshot."),
+    _duration("weights_apply_s", "Time from the publication of weights until a worker acts with them.", by_worker=True),
     _counter("weights_published_total", "snapshots", "Weight snapshots published."),
+)
+
+_INFERENCE = (
+    _counter("inference_steps_total", "steps", "Observations acted on by central inference, since its process began."),
+    _counter("inference_busy_s_total", "s", "Time that central inference has computed, since its process began."),
+    _gauge("inference_batch_steps", "steps", "Mean number of observations that central inference computes at once."),
+    _counter(
+        *("inference_restarts_total", "restarts", "Central inference processes replaced, by reason."),
+        *("reason", RESTART_REASONS),
+    ),
 )
 
 _LEARNER = (
@@ -211,7 +224,7 @@ _SINK = (
 METRICS: dict[str, Metric] = {
     metric.name: metric
     for group in (
-        *(_RUN, _WORKER, _REPLAY, _LIMITER, _WEIGHTS, _LEARNER),
+        *(_RUN, _WORKER, _REPLAY, _LIMITER, _WEIGHTS, _INFERENCE, _LEARNER),
         *(_EPISODE, _EVAL, _PRETRAIN, _CHECKPOINT, _SINK),
     )
     for metric in group
@@ -246,6 +259,11 @@ def check_names(keys: Iterable[str]) -> None:
     """Raise ``ValueError`` for the first key that `find_metric` does not know."""
     for key in keys:
         find_metric(key)
+
+
+def metric_labels(config: RunConfig, run: str) -> dict[str, str]:
+    """What Prometheus tells one run's values from another's by, whichever sink they go through."""
+    return {"run": run, "variant": config.variant, "seed": str(config.seed)}
 
 
 def phase_index(phase: str) -> int:

@@ -1,81 +1,43 @@
 """A run from nothing to its report: collect, pre-train, train, evaluate. The same for every backend."""
 
 import contextlib
-import signal
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 
-from slotfilm_dist.backend import Backend, Player, TrainReport
+from slotfilm_dist.backend import Backend, Player, RunFailedError, TrainReport
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.evaluation.page import write_page
 from slotfilm_dist.evaluation.record import Evaluation, save_evaluation, summarize
 from slotfilm_dist.learning.learner import dataset_hash, dataset_schema, pretrain_hash
 from slotfilm_dist.messages import EpisodeSummary
-from slotfilm_dist.metrics import phase_index
+from slotfilm_dist.metrics import metric_labels, phase_index
 from slotfilm_dist.progress import Phase, Progress
 from slotfilm_dist.replay.dataset import MANIFEST
 from slotfilm_dist.replay.dataset_writer import FrameDatasetWriter
 from slotfilm_dist.runs import RunDirectory
+from slotfilm_dist.saving import Saver
 from slotfilm_dist.sinks import ClosableSink, FanOut, JsonLinesSink, PrometheusSink, TensorBoardSink
+from slotfilm_dist.stopping import Interrupted, StopFlag
 
 RECENT_EPISODES = 20
 """Episodes that the shown return is averaged over."""
 POLICY_NAMES: dict[Player, str] = {"random": "random", "expert": "scripted expert", "agent": "trained, deterministic"}
 
 
-class Interrupted(Exception):
-    """A signal asked the run to stop; everything needed to go on has been written."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(f"stopped by {signal.Signals(number).name}")
-        self.exit_code = 128 + number
-
-
-class StopFlag:
-    """Remembers the first SIGINT or SIGTERM; a second one ends the process at once."""
-
-    def __init__(self) -> None:
-        self.signal_number = 0
-
-    def __call__(self) -> bool:
-        """Whether to stop."""
-        return self.signal_number != 0
-
-    def check(self) -> None:
-        """Raise `Interrupted` if a signal has come."""
-        if self.signal_number:
-            raise Interrupted(self.signal_number)
-
-    @contextmanager
-    def listening(self) -> Iterator[None]:
-        """Listen while the body runs."""
-
-        def remember(number: int, frame: FrameType | None) -> None:
-            if self.signal_number:
-                raise KeyboardInterrupt
-            self.signal_number = number
-
-        before = {number: signal.signal(number, remember) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-
 def open_sinks(run: RunDirectory) -> list[ClosableSink]:
     """Where a run's metrics go: its own files, and Prometheus unless that is turned off."""
     sinks: list[ClosableSink] = [JsonLinesSink(run.metrics), TensorBoardSink(run.path / "tensorboard")]
     config = run.config
-    if config.runtime.metrics_port:
-        labels = {"run": run.path.name, "variant": config.variant, "seed": str(config.seed)}
-        sinks.append(PrometheusSink(config.runtime.metrics_port, labels))
+    if config.runtime.metrics_port and config.runtime.mode == "ray":
+        from slotfilm_dist.cluster.ray_sink import RaySink  # Ray is imported only where it is used
+
+        sinks.append(RaySink(metric_labels(config, run.path.name)))
+    elif config.runtime.metrics_port:
+        sinks.append(PrometheusSink(config.runtime.metrics_port, metric_labels(config, run.path.name)))
     return sinks
 
 
@@ -105,6 +67,8 @@ class Pipeline:
         self._best = float("-inf")
         self._returns: deque[float] = deque(maxlen=RECENT_EPISODES)
         self._solved: deque[bool] = deque(maxlen=RECENT_EPISODES)
+        self._num_played = 0
+        self._played_s = 0.0
 
     def execute(self) -> Path:
         """Do what is left to do; gives the report's path.
@@ -182,7 +146,9 @@ class Pipeline:
         next_evaluation = int(
             values.get("next_evaluation", config.schedule.random_steps + config.evaluation.every_steps)
         )
-        next_save = int(values.get("updates", 0)) + config.checkpoint.every_updates
+        self._saver = Saver(
+            self._backend, self._run.checkpoints, config.checkpoint.every_updates, int(values.get("updates", 0))
+        )
         report = TrainReport(env_steps=0, updates=0, metrics={})
         for report in self._backend.train(self._stop):
             self._note(report)
@@ -191,11 +157,14 @@ class Pipeline:
                 with contextlib.suppress(Interrupted):
                     self._evaluate_now(report)
                     next_evaluation = report.env_steps + config.evaluation.every_steps
-            if report.updates >= next_save:
+            if self._saver.due(report):
                 self._save(report, next_evaluation, with_replay=False)
-                next_save = report.updates + config.checkpoint.every_updates
         done = report.env_steps >= total
-        self._save(report, next_evaluation, with_replay=config.checkpoint.save_replay and not done, trained=done)
+        problem = self._save(
+            report, next_evaluation, with_replay=config.checkpoint.save_replay and not done, trained=done
+        )
+        if problem:
+            raise RunFailedError(f"the last checkpoint could not be written: {problem}; make room, then --resume")
         self._progress.end(f"{report.env_steps} steps, {report.updates} updates")
         self._stop.check()
 
@@ -205,21 +174,33 @@ class Pipeline:
         self._write("train", report.env_steps, report.updates, self._evaluation_metrics(result))
         if result.mean_return > self._best:
             self._best = result.mean_return
-            self._backend.save(self._run.checkpoints, {"best_return": self._best}, with_replay=False, best=True)
+            metrics, problem = self._saver.save(report, {"best_return": self._best}, with_replay=False, best=True)
+            self._tell_save(report, metrics, problem)
 
-    def _save(self, report: TrainReport, next_evaluation: int, *, with_replay: bool, trained: bool = False) -> None:
+    def _save(self, report: TrainReport, next_evaluation: int, *, with_replay: bool, trained: bool = False) -> str:
+        """Write a checkpoint; gives why it could not be written, empty if it was."""
         values = {"next_evaluation": next_evaluation, "best_return": self._best, "env_steps": report.env_steps}
-        started = time.monotonic()
-        size = self._backend.save(self._run.checkpoints, values, with_replay=with_replay)
-        metrics = {"checkpoint_bytes": float(size), "checkpoint_write_s": time.monotonic() - started}
+        metrics, problem = self._saver.save(report, values, with_replay=with_replay)
+        self._tell_save(report, metrics, problem)
+        if not problem:
+            self._run.write_status(
+                phase="train",
+                env_steps=report.env_steps,
+                updates=report.updates,
+                trained=trained,
+                time_s=self._time_s(),
+            )
+        return problem
+
+    def _tell_save(self, report: TrainReport, metrics: Mapping[str, float], problem: str) -> None:
         self._write("train", report.env_steps, report.updates, metrics)
-        self._run.write_status(
-            phase="train", env_steps=report.env_steps, updates=report.updates, trained=trained, time_s=self._time_s()
-        )
+        if problem:
+            self._progress.say(f"   train  a checkpoint could not be written, the one before stays: {problem}")
 
     def _evaluate(self) -> None:
         config = self._config
         seeds = self._seeds(config.evaluation.episodes)
+        self._write("evaluate", config.schedule.total_steps, None, self._run.room())
         self._progress.begin("evaluate", f"{len(seeds)} episodes each: the random policy, the trained agent")
         random = self._play("random", "random", seeds, 0)
         final = self._play("final", "agent", seeds, config.schedule.total_steps)
@@ -242,13 +223,16 @@ class Pipeline:
 
     def _play(self, name: str, player: Player, seeds: list[int], env_steps: int) -> Evaluation:
         episodes: list[EpisodeSummary] = []
+        began = time.monotonic()
         for episode in self._backend.play(player, seeds):
             episodes.append(episode)
+            self._num_played += 1
             mean = np.mean([e.episode_return for e in episodes])
             self._progress.show(len(episodes), len(seeds), {"policy": player, "return": f"{mean:.1f}"})
             self._stop.check()
         result = summarize(name, POLICY_NAMES[player], env_steps, tuple(episodes), self._backend.reward_term_names)
         save_evaluation(result, self._run.path)
+        self._played_s = time.monotonic() - began
         return result
 
     def _seeds(self, count: int) -> list[int]:
@@ -262,12 +246,15 @@ class Pipeline:
             "eval_return_std": result.std_return,
             "eval_success_rate": result.success_rate,
             "eval_success_once_rate": float(np.mean([e.success_once for e in result.episodes])),
+            "eval_duration_s": self._played_s,
+            "eval_episodes_total": float(self._num_played),
         }
 
     def _note(self, report: TrainReport) -> None:
         """Write a report's numbers and show them."""
         self._note_episodes(report.episodes, report.env_steps)
-        self._write("train", report.env_steps, report.updates, report.metrics)
+        own = self._saver.age(report) | self._run.room() | self._eta(report)
+        self._write("train", report.env_steps, report.updates, dict(report.metrics) | own)
         values = {
             "steps/s": f"{report.metrics.get('worker_env_steps_per_s', 0):.0f}",
             "updates/s": f"{report.metrics.get('learner_updates_per_s', 0):.0f}",
@@ -292,6 +279,12 @@ class Pipeline:
         if updates is not None:
             axes["updates"] = updates
         self._sink.write(axes | dict(values))
+
+    def _eta(self, report: TrainReport) -> dict[str, float]:
+        """Time to the last step at the present rate; nothing while nobody collects."""
+        rate = report.metrics.get("worker_env_steps_per_s", 0.0)
+        left = self._config.schedule.total_steps - report.env_steps
+        return {"run_eta_s": left / rate} if rate > 0 else {}
 
     def _time_s(self) -> float:
         return time.monotonic() - self._began

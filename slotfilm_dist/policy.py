@@ -16,8 +16,12 @@ from slotfilm_dist.nets.interface import Encoder
 class Policy(Protocol):
     """Chooses actions. The loop that uses it: visual = policy.visual(observation); policy.act(observation, visual)."""
 
-    version: int
     backbone_hash: str
+
+    @property
+    def version(self) -> int:
+        """Of the weights that act; -1 without any."""
+        ...
 
     def visual(self, observation: Observation) -> Shaped[np.ndarray, "envs *visual"]:
         """What the policy sees of the pictures and replay stores of them."""

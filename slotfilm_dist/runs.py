@@ -1,11 +1,13 @@
 """A run's directory: its config, versions, logs and checkpoints, and the lock that keeps it to one driver."""
 
+import contextlib
 import dataclasses
 import importlib.metadata
 import json
 import os
 import platform
 import re
+import shutil
 import socket
 import sys
 import time
@@ -14,16 +16,17 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import psutil
 from filelock import FileLock, Timeout
 
 from slotfilm_dist import __version__
 from slotfilm_dist.atomic import write_atomic
-from slotfilm_dist.config import RunConfig, changed_fields, save_config
+from slotfilm_dist.config import TEMPERATURE_FIELDS, RunConfig, changed_fields, save_config
 from slotfilm_dist.messages import EpisodeSummary
 
 PACKAGES = ("ray", "torch", "torchvision", "mani_skill", "sapien", "gymnasium", "numpy", "msgpack", "safetensors")
 RUN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-RESUMABLE = ("schedule", "evaluation", "runtime", "checkpoint", "lr", "sac.temperature", "sac.temperature_mode")
+RESUMABLE = ("schedule", "evaluation", "runtime", "checkpoint", "lr", *(f"sac.{name}" for name in TEMPERATURE_FIELDS))
 """Sections and fields that may change when a run is resumed: budgets, places, and what is annealed by hand."""
 
 
@@ -58,6 +61,17 @@ def resumed_config(path: Path, config: RunConfig, changed: RunConfig) -> RunConf
     return changed
 
 
+def refuse_if_held(path: Path) -> None:
+    """Raise ``ValueError`` if another driver has this run, before anything is started for it."""
+    if not (path / ".lock").exists():
+        return
+    try:
+        with FileLock(path / ".lock").acquire(timeout=0):
+            return
+    except Timeout:
+        raise ValueError(_in_use(path)) from None
+
+
 class RunDirectory:
     """One run on disk, held by one driver at a time.
 
@@ -78,11 +92,7 @@ class RunDirectory:
         try:
             self._lock.acquire(timeout=0)
         except Timeout:
-            owner = self._read("owner.json")
-            raise ValueError(
-                f"{self.path} is in use by process {owner.get('pid', '?')} on {owner.get('host', 'another machine')}; "
-                "stop it first, or start a new run"
-            ) from None
+            raise ValueError(_in_use(self.path)) from None
         save_config(self.config, self.path / "config.json")
         self._write("owner.json", {"pid": os.getpid(), "host": socket.gethostname(), "since": _now()})
         if not (self.path / "versions.json").exists():
@@ -111,6 +121,15 @@ class RunDirectory:
                 record = dataclasses.asdict(episode) | {"env_steps": env_steps, "policy_version": policy_version}
                 file.write(json.dumps(record) + "\n")
 
+    def room(self) -> dict[str, float]:
+        """Resident memory of this process and those it started (what they share counts once for each); free disk."""
+        process = psutil.Process()
+        memory = 0
+        for member in (process, *process.children(recursive=True)):
+            with contextlib.suppress(psutil.Error):  # it may have ended since
+                memory += member.memory_info().rss
+        return {"run_memory_bytes": float(memory), "run_disk_free_bytes": float(shutil.disk_usage(self.path).free)}
+
     def read_status(self) -> dict[str, Any]:
         """How far the run has come: what `write_status` last wrote, empty before."""
         return self._read("status.json")
@@ -128,6 +147,17 @@ class RunDirectory:
 
     def _write(self, name: str, values: dict[str, Any]) -> None:
         write_atomic(self.path / name, [json.dumps(values, indent=1).encode()])
+
+
+def _in_use(path: Path) -> str:
+    try:
+        owner = json.loads((path / "owner.json").read_text(encoding="utf-8"))
+    except (FileNotFoundError, UnicodeDecodeError, json.JSONDecodeError):
+        owner = {}
+    return (
+        f"{path} is in use by process {owner.get('pid', '?')} on {owner.get('host', 'another machine')}; "
+        "stop it first, or start a new run"
+    )
 
 
 def describe_machine() -> dict[str, Any]:

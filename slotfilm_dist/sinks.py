@@ -1,7 +1,8 @@
 """Where metric values go: a file of JSON lines, TensorBoard, Prometheus, or all of them.
 
-Every sink is a `MetricSink`: `write(values)` takes values by key (see `metrics.find_metric`), among them the axes
-`time_s`, `env_steps`, `updates` and `phase`. An axis that is left out keeps its last value.
+Inside Ray, `cluster/ray_sink.py` takes the place of `PrometheusSink`. Every sink is a `MetricSink`: `write(values)`
+takes values by key (see `metrics.find_metric`), among them the axes `time_s`, `env_steps`, `updates` and `phase`. An
+axis that is left out keeps its last value.
 """
 
 import json
@@ -219,17 +220,19 @@ class _LatestValues(Collector):
         for key, value in values.items():
             metric, label = find_metric(key)
             family = families.setdefault(metric.name, self._family(metric))
-            family.add_metric([*self._labels.values(), *([label] if metric.label else [])], value)
+            labels = [*self._labels.values(), metric.role, "", *([label] if metric.label else [])]
+            family.add_metric(labels, value)
         yield from families.values()
         for key, counts in buckets.items():
             metric, _ = find_metric(key)
-            histogram = HistogramMetricFamily(metric.exported_name, metric.help, labels=list(self._labels))
-            histogram.add_metric(list(self._labels.values()), _cumulative(counts), sums[key])
+            names = [*self._labels, "role", "worker"]
+            histogram = HistogramMetricFamily(metric.exported_name, metric.help, labels=names)
+            histogram.add_metric([*self._labels.values(), metric.role, ""], _cumulative(counts), sums[key])
             yield histogram
 
     def _family(self, metric: Metric) -> GaugeMetricFamily | CounterMetricFamily:
         kind = CounterMetricFamily if metric.kind == "counter" else GaugeMetricFamily
-        names = [*self._labels, *([metric.label] if metric.label else [])]
+        names = [*self._labels, "role", "worker", *([metric.label] if metric.label else [])]
         return kind(metric.exported_name, f"{metric.help} Unit: {metric.unit}.", labels=names)
 
 

@@ -4,13 +4,22 @@ Imports of a role stand in its constructor, so that a shard's process never load
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import ray
 
-from slotfilm_dist.cluster.messages import AgentSetup, BlockKey, BlockNotice, LearnerStatus, WorkerBeat
+from slotfilm_dist.cluster.messages import (
+    AgentSetup,
+    BlockKey,
+    BlockNotice,
+    InferenceAnswer,
+    InferenceRequest,
+    InferenceStatus,
+    LearnerStatus,
+    WorkerBeat,
+)
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.messages import EpisodeSummary, TransitionBlock, WeightSnapshot
 
@@ -32,15 +41,29 @@ class HubActor:
             max(config.replay.min_steps, schedule.random_steps),
             config.runtime.block_steps,
         )
-        self._hub = Hub(limiter, schedule.total_steps, config.runtime.num_workers)
+        runtime = config.runtime
+        self._hub = Hub(limiter, schedule.total_steps, runtime.num_workers, auto_workers=runtime.auto_workers)
 
     @ray.method(concurrency_group="workers")
-    def admit_steps(self, notice: BlockNotice, stored: Sequence[BlockKey], held_version: int, timeout_s: float) -> Any:
-        return self._hub.admit_steps(notice, stored, held_version, timeout_s)
+    def admit_steps(self, notice: BlockNotice, stored: Sequence[BlockKey], timeout_s: float) -> Any:
+        return self._hub.admit_steps(notice, stored, timeout_s)
 
     @ray.method(concurrency_group="learner")
     def admit_updates(self, max_updates: int, timeout_s: float) -> Any:
         return self._hub.admit_updates(max_updates, timeout_s)
+
+    @ray.method(concurrency_group="publish")
+    def publish(self, snapshot: WeightSnapshot) -> None:
+        """Put weights where every process of a node reads the same copy, then tell those who wait for them."""
+        if snapshot.version >= self._hub.newest_version():
+            self._shared = snapshot.version, ray.put(snapshot)
+            self._hub.publish(snapshot)
+
+    @ray.method(concurrency_group="weights")
+    def await_newer(self, newer_than: int, timeout_s: float) -> list[Any]:
+        """The newest weights' place in the object store, in a list, or an empty one when time runs out."""
+        newer = self._hub.await_newer(newer_than, timeout_s)
+        return [self._shared[1]] if newer is not None else []
 
     @ray.method(concurrency_group="control")
     def call(self, method: str, *arguments: Any) -> Any:
@@ -82,16 +105,27 @@ class ShardActor:
 
 
 class WorkerActor:
-    """A `WorkerLoop` in a process."""
+    """A `WorkerLoop` in a process, which exports its own metrics with its beats."""
 
-    def __init__(self, config: RunConfig, worker_id: int, make_env: "EnvFactory", limits: "Limits") -> None:
+    def __init__(
+        self,
+        config: RunConfig,
+        worker_id: int,
+        make_env: "EnvFactory",
+        limits: "Limits",
+        labels: Mapping[str, str],
+    ) -> None:
         _prepare_for_acting(config)
+        from slotfilm_dist.cluster.ray_sink import RaySink
+        from slotfilm_dist.cluster.reporting import WorkerMetrics
         from slotfilm_dist.cluster.worker import WorkerLoop
+        from slotfilm_dist.sinks import FanOut
 
         self._loop = WorkerLoop(config, worker_id, make_env, limits)
+        self._metrics = WorkerMetrics(FanOut([RaySink(labels, str(worker_id))] if labels else []))
 
-    def train(self, incarnation: int, hub: Any, store: Any, setup: AgentSetup) -> None:
-        self._loop.train(incarnation, hub, store, setup)
+    def train(self, incarnation: int, hub: Any, store: Any, agent: Any) -> None:
+        self._loop.train(incarnation, hub, store, agent)
 
     def collect_randomly(self, incarnation: int) -> None:
         self._loop.collect_randomly(incarnation)
@@ -107,7 +141,50 @@ class WorkerActor:
 
     @ray.method(concurrency_group="control")
     def beat(self) -> WorkerBeat:
-        return self._loop.beat()
+        beat = self._loop.beat()
+        self._metrics.note(beat)
+        return beat
+
+    @ray.method(concurrency_group="control")
+    def process_id(self) -> int:
+        return os.getpid()
+
+
+class InferenceActor:
+    """An `InferenceServer` in a process; started again by Ray when it dies. It exports how late its weights are.
+
+    The agent comes from the hub and not as an argument: Ray may have dropped a large argument when it starts it again.
+    """
+
+    def __init__(self, config: RunConfig, hub: Any, labels: Mapping[str, str], *, gpu: bool) -> None:
+        import torch
+
+        from slotfilm_dist.cluster.inference import InferenceServer
+        from slotfilm_dist.cluster.ray_sink import RaySink
+        from slotfilm_dist.cluster.worker import build_policy
+        from slotfilm_dist.seeds import Role, role_seed
+        from slotfilm_dist.sinks import FanOut
+
+        torch.set_num_threads(config.runtime.worker_threads)
+        device = torch.device("cuda" if gpu else "cpu")
+        policy = build_policy(config, hub.agent_setup(), role_seed(config.seed, Role.ACTIONS), device=device)
+        self._server = InferenceServer(policy, hub)
+        self._sink = FanOut([RaySink(labels, "central")] if labels else [])
+
+    @ray.method(concurrency_group="requests")
+    def infer(self, request: InferenceRequest) -> InferenceAnswer:
+        return self._server.infer(request)
+
+    @ray.method(concurrency_group="control")
+    def policy_version(self) -> int:
+        return self._server.policy_version
+
+    @ray.method(concurrency_group="control")
+    def status(self) -> InferenceStatus:
+        status = self._server.status()
+        for lag_s in status.weights_lags_s:
+            self._sink.write({"weights_apply_s": lag_s})
+        return status
 
     @ray.method(concurrency_group="control")
     def process_id(self) -> int:
@@ -168,9 +245,10 @@ def _prepare_for_acting(config: RunConfig) -> None:
 
 
 CONCURRENCY: dict[type, dict[str, int]] = {
-    HubActor: {"workers": 64, "learner": 2, "control": 4},
+    HubActor: {"workers": 64, "weights": 64, "learner": 2, "publish": 1, "control": 4},
     ShardActor: {"insert": 2, "draw": 2, "control": 2, "snapshot": 1},
     WorkerActor: {"control": 1},
+    InferenceActor: {"requests": 64, "control": 2},
     LearnerActor: {"control": 2},
     PlayerActor: {},
 }

@@ -1,5 +1,7 @@
 """The roles of a run as processes on a Ray cluster, behind the same interface as one process."""
 
+import contextlib
+import dataclasses
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -7,40 +9,34 @@ from typing import Any
 
 from slotfilm_dist.backend import Player, TrainReport
 from slotfilm_dist.cluster.evaluation import EvaluationPool
-from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError, RunFailedError
+from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
 from slotfilm_dist.cluster.hub_client import HubClient
+from slotfilm_dist.cluster.inference_client import InferenceClient
+from slotfilm_dist.cluster.learner_keeper import LONG_S, STOP_S, LearnerKeeper
 from slotfilm_dist.cluster.messages import AgentSetup, LearnerStatus
-from slotfilm_dist.cluster.placement import plan
+from slotfilm_dist.cluster.placement import STATE_RESOURCE, plan
 from slotfilm_dist.cluster.replay_client import ReplayClient, ShardClient
 from slotfilm_dist.cluster.reporting import Reporter
-from slotfilm_dist.cluster.role_clients import LearnerClient
 from slotfilm_dist.cluster.session import Session, namespace_of, read_cluster_file
 from slotfilm_dist.cluster.system import ShardWatch
+from slotfilm_dist.cluster.wiring import Wiring
 from slotfilm_dist.cluster.workforce import Workforce, make_wrist_env
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.contracts import VectorEnv
-from slotfilm_dist.machine import usable_cores
-from slotfilm_dist.messages import EpisodeSummary, TransitionBlock
+from slotfilm_dist.messages import EpisodeSummary, TransitionBlock, WeightSnapshot
+from slotfilm_dist.metrics import metric_labels
 from slotfilm_dist.seeds import Role, role_seed
 
 SLICE_S = 0.1
 """Waits for a stop are cut in slices of this length."""
 REPORT_S = 1.0
 """Seconds between reports of training."""
-STOP_S = 5.0
-"""Time that the learner gets to finish its update."""
-LEARNER_SILENCE_S = 60.0
-"""Time without an answer after which the learner counts as lost."""
 SNAPSHOT_S = 600.0
 """Seconds between snapshots of replay in the background."""
 PRETRAIN_CHUNK = 10
 """Pre-training steps between reports."""
 PRETRAIN_SAVE_S = 60.0
 """Seconds between checkpoints of an unfinished pre-training."""
-LONG_S = 3600.0
-"""Longest wait for what depends on the size of data: reading, encoding, writing."""
-MAX_LEARNER_RESTARTS = 10
-"""Losses of the learner before the run is given up."""
 INCARNATIONS_PER_START = 100_000
 """Incarnations of one start of a run; the next start counts on from a higher number than any before."""
 
@@ -54,6 +50,7 @@ class RayBackend:
         make_env: builds an environment; a function at the top of a module.
         limits: how long workers may go without progress; None for the defaults.
         snapshot_s: seconds between snapshots of replay.
+        wiring: what lies between the learner and its links.
     """
 
     def __init__(
@@ -63,17 +60,20 @@ class RayBackend:
         make_env: Callable[[RunConfig, bool], VectorEnv] = make_wrist_env,
         limits: Any = None,
         snapshot_s: float = SNAPSHOT_S,
+        wiring: Wiring | None = None,
     ) -> None:
         self._config, self._run, self._make_env = config, run.resolve(), make_env
-        self._limits, self._snapshot_s = limits, snapshot_s
+        self._limits, self._snapshot_s, self._wiring = limits, snapshot_s, wiring or Wiring()
         self._session: Session | None = None
-        self._learner: LearnerClient | None = None
+        self._learner: LearnerKeeper | None = None
         self._hub: HubClient | None = None
+        self._inference: InferenceClient | None = None
+        self._labels = metric_labels(config, run.resolve().name) if config.runtime.metrics_port else {}
         self._workforce: Workforce | None = None
         self._pool: EvaluationPool | None = None
         self._shards: list[ShardClient] = []
         self._setup: AgentSetup | None = None
-        self._learner_restarts = 0
+        self._training = False
         self.action_dim = 0
         self.reward_term_names: tuple[str, ...] = ()
 
@@ -84,19 +84,21 @@ class RayBackend:
             ValueError: the cluster lacks what the config asks for, or initial weights cannot be had.
             RunFailedError: no worker could build its environment; names why.
         """
-        config, session = self._config, Session()
+        config, session = self._config, Session(metrics_port=self._config.runtime.metrics_port)
         self._session = session
-        self._placement = plan(config, session.nodes())
+        kept = session.place(STATE_RESOURCE)
+        self._placement = dataclasses.replace(plan(config, session.nodes()), state_resources=kept)
         self._starts = int(read_cluster_file(self._run).get("starts", 0)) + 1
-        self._hub = HubClient.launch(config, namespace_of(self._run))
+        self._hub = HubClient.launch(config, namespace_of(self._run), kept)
         self._workforce = Workforce(
             *(config, session, self._hub, self._make_env, self._limits, self._placement.share_cpus),
             first_incarnation=self._starts * INCARNATIONS_PER_START,
             snapshot_s=self._snapshot_s,
+            labels=self._labels,
         )
         self.action_dim, self.reward_term_names = self._workforce.describe()
         if config.encoder.uses_image and config.encoder.backbone != "random":
-            self._launch_learner().call("fetch_weights", timeout_s=LONG_S)
+            self._learning.call("fetch_weights")
 
     def enter(self) -> None:
         """Note in the run directory where the run lives, so that `slotfilm scale` finds it."""
@@ -111,35 +113,36 @@ class RayBackend:
     def pretrain(self, dataset: Path, artifact: Path) -> Iterator[dict[str, float]]:
         """Pre-train in the learner's process, continuing what an interrupted pre-training left."""
         self.enter()
-        learner = self._learner or self._launch_learner()
+        learner = self._learning
         dataset, artifact = dataset.resolve(), artifact.resolve()
-        learner.call("begin_pretraining", dataset, artifact, timeout_s=LONG_S)
+        learner.call("begin_pretraining", dataset, artifact)
         saved_at, done = time.monotonic(), 0
         while done < self._config.pretrain.steps:
-            metrics, done = learner.call("pretrain", PRETRAIN_CHUNK, timeout_s=LONG_S)
+            metrics, done = learner.call("pretrain", PRETRAIN_CHUNK)
             if metrics:
                 yield metrics
             self._workers.check()
             if time.monotonic() - saved_at > PRETRAIN_SAVE_S:
-                learner.call("save_pretraining", artifact, finished=False, timeout_s=LONG_S)
+                learner.call("save_pretraining", artifact, finished=False)
                 saved_at = time.monotonic()
-        learner.call("save_pretraining", artifact, finished=True, timeout_s=LONG_S)
+        learner.call("save_pretraining", artifact, finished=True)
 
     def begin_training(self, dataset: Path, pretrained: Path | None, resume_from: Path | None) -> dict[str, Any]:
         """Build the learner in its process; replay follows in `train`."""
         self.enter()
-        self._sources = dataset.resolve(), pretrained.resolve() if pretrained else None
         self._resumed = resume_from is not None
-        learner = self._learner or self._launch_learner()
-        values, self._schema, random_steps = learner.call(
-            "begin", *self._sources, resume_from.resolve() if resume_from else None, timeout_s=LONG_S
+        beginning = self._learning.begin(
+            dataset.resolve(),
+            pretrained.resolve() if pretrained else None,
+            resume_from.resolve() if resume_from else None,
         )
-        if values:
-            self._counts.load(values["limiter"])
+        self._schema = beginning.schema
+        if beginning.values:
+            self._counts.load(beginning.values["limiter"])
         else:
-            self._counts.count_random_steps(random_steps)
+            self._counts.count_random_steps(beginning.random_steps)
         self._setup = self._counts.agent_setup()
-        return values
+        return beginning.values
 
     def load_agent(self, checkpoints: Path) -> int:
         """Build the agent of a run's newest checkpoint, to play with; gives the environment steps it learned from.
@@ -147,8 +150,7 @@ class RayBackend:
         Raises:
             ValueError: there is no checkpoint that can be used.
         """
-        learner = self._learner or self._launch_learner()
-        env_steps = learner.call("load_agent", checkpoints.resolve(), timeout_s=LONG_S)
+        env_steps = self._learning.call("load_agent", checkpoints.resolve())
         self._workers.stop()
         self._setup = self._counts.agent_setup()
         return env_steps
@@ -157,23 +159,27 @@ class RayBackend:
         """Train until the schedule's end, or until `should_stop`, reporting once a second."""
         self._build_replay()
         workers, reporter = self._workers, Reporter(self._config)
-        self._learning.call("start", timeout_s=LONG_S)
+        self._learning.start(self._replay_client)
         assert self._setup is not None, "begin_training comes first"
-        workers.train(self._shards, self._watch, self._setup)
-        finished = False
+        if self._placement.central_inference:
+            self._inference = InferenceClient.launch(self._config, self._counts, self._placement, self._labels)
+        workers.train(self._shards, self._watch, self._inference or self._setup)
+        finished, self._training = False, True
         while not (finished or should_stop()):
             _wait(REPORT_S, should_stop)
             workers.check()
-            status = self._learner_status()
+            status = self._learning.status()
             report = self._report(reporter, status)
             yield report
             self._close_players()
             counts = self._counts.status()
+            workers.adapt(counts, status.metrics.get("learner_wait_s_total", 0.0))
             finished = counts.finished and counts.updates_owed == 0 and status.updates >= counts.updates
+        self._training = False
         workers.stop()
         self._learning.call("stop", STOP_S, timeout_s=2 * STOP_S)
         self._watch.tick(wait=True)
-        yield self._report(reporter, self._learner_status())
+        yield self._report(reporter, self._learning.status())
 
     def play(self, player: Player, seeds: Sequence[int]) -> Iterator[EpisodeSummary]:
         """Play episodes in processes of their own; training goes on meanwhile."""
@@ -182,7 +188,7 @@ class RayBackend:
         # While training goes on, its workers keep most of the cores.
         size = num_workers // 2 if num_workers else self._config.runtime.num_workers
         pool = self._players(max(1, min(len(seeds), size)))
-        snapshot = self._counts.latest(-1) if player == "agent" else None
+        snapshot = self._acting_weights() if player == "agent" else None
         yield from pool.play(player, seeds, camera=camera, setup=self._setup, snapshot=snapshot)
 
     def record(self, player: Player, seed: int, video: Path, film_strip: Path) -> EpisodeSummary:
@@ -193,13 +199,20 @@ class RayBackend:
         )
 
     def save(self, folder: Path, values: Mapping[str, Any], *, with_replay: bool, best: bool = False) -> int:
-        """Write a checkpoint in the learner's process, and replay beside it."""
+        """Write a checkpoint in the learner's process, and replay beside it.
+
+        Raises:
+            OSError: it could not be written, or a role was lost that should have written it.
+        """
         own = {"limiter": self._counts.save(0)}
-        size, _ = self._learning.call("save", folder.resolve(), own | dict(values), best=best, timeout_s=LONG_S)
-        if with_replay and not best:
-            requests = [(shard, shard.begin_snapshot()) for shard in self._shards]
-            for shard, request in requests:
-                shard.await_snapshot(request, LONG_S)
+        try:
+            size, _ = self._learning.call("save", folder.resolve(), own | dict(values), best=best)
+            if with_replay and not best:
+                requests = [(shard, shard.begin_snapshot()) for shard in self._shards]
+                for shard, request in requests:
+                    shard.await_snapshot(request, LONG_S)
+        except (RoleLostError, RoleSilentError) as error:
+            raise OSError(str(error)) from error
         return size
 
     def close(self) -> None:
@@ -209,9 +222,11 @@ class RayBackend:
             _attempt(self._workforce.close)
             self._workforce = None
         if self._learner is not None:
-            learner, self._learner = self._learner, None
-            _attempt(lambda: learner.call("stop", STOP_S / 2, timeout_s=STOP_S))
-            learner.kill()
+            _attempt(self._learner.close)
+            self._learner = None
+        if self._inference is not None:
+            self._inference.kill()
+            self._inference = None
         for shard in self._shards:
             shard.kill()
         self._shards = []
@@ -227,11 +242,17 @@ class RayBackend:
         """Ask for another number of workers; the caretaker starts or stops them."""
         self._counts.want_workers(num_workers)
 
+    def want_auto_workers(self) -> None:
+        """Let the run decide how many workers it needs."""
+        self._counts.want_auto_workers()
+
     def process_ids(self) -> dict[str, int]:
         """Of the processes that live now, by the role's name."""
         ids = {f"shard {shard.index}": shard.process_id() for shard in self._shards}
         if self._learner is not None:
             ids["learner"] = self._learner.process_id()
+        if self._inference is not None:
+            ids["inference"] = self._inference.process_id()
         ids["hub"] = self._counts.process_id()
         return ids | self._workers.process_ids()
 
@@ -246,69 +267,39 @@ class RayBackend:
         return self._hub
 
     @property
-    def _learning(self) -> LearnerClient:
-        assert self._learner is not None, "begin_training comes first"
+    def _learning(self) -> LearnerKeeper:
+        """The learner, whose process starts at the first need."""
+        if self._learner is None:
+            self._learner = LearnerKeeper(
+                *(self._config, self._run, self._counts, self._placement, self.action_dim), wiring=self._wiring
+            )
         return self._learner
 
-    def _launch_learner(self) -> LearnerClient:
-        threads = self._config.runtime.learner_threads or max(1, int(usable_cores()) // 2)
-        self._learner = LearnerClient.launch(
-            self._config,
-            self.action_dim,
-            threads,
-            self._counts,
-            num_cpus=self._placement.share_cpus,
-            gpu=self._placement.gpu,
-        )
-        return self._learner
+    def _acting_weights(self) -> WeightSnapshot | None:
+        """What an evaluation plays with; while training goes on, the learner keeps all of it, as it may become `best`."""
+        with contextlib.suppress(RoleLostError, RoleSilentError):  # the next report replaces it
+            if self._training:
+                return self._learning.call("hold_candidate")
+        return self._counts.latest(-1)
 
     def _build_replay(self) -> None:
         """Start the shards, with what a run that goes on had stored, or with the random policy's data."""
         folder = self._run / "checkpoints" / "replay"
         self._shards = [
-            ShardClient.launch(self._config, self._schema, index, folder / f"shard-{index:02d}", resume=self._resumed)
+            ShardClient.launch(
+                *(self._config, self._schema, index, folder / f"shard-{index:02d}"),
+                resume=self._resumed,
+                resources=self._placement.state_resources,
+            )
             for index in range(self._config.replay.num_shards)
         ]
         stored = [shard.beat(LONG_S).stats.num_steps for shard in self._shards]
-        self._learning.call("connect", self._replay_client(), timeout_s=LONG_S)
         if sum(stored) == 0:
-            self._learning.call("refill", self._sources[0], timeout_s=LONG_S)
+            self._learning.refill(self._replay_client)
         self._watch = ShardWatch(self._shards, self._config.replay.min_steps, self._counts.start_over)
 
     def _replay_client(self) -> ReplayClient:
-        return ReplayClient(self._shards, role_seed(self._config.seed, Role.REPLAY, 0, self._learner_restarts))
-
-    def _learner_status(self) -> LearnerStatus:
-        """How the learner does; a lost one is replaced and goes on from the last checkpoint.
-
-        Raises:
-            RunFailedError: it failed by itself, or was lost too often.
-        """
-        try:
-            status = self._learning.status(LEARNER_SILENCE_S)
-        except (RoleLostError, RoleSilentError) as error:
-            return self._replace_learner(error)
-        if status.error:
-            raise RunFailedError(f"the learner stopped: {status.error}; go on with --resume")
-        return status
-
-    def _replace_learner(self, error: Exception) -> LearnerStatus:
-        self._learner_restarts += 1
-        if self._learner_restarts > MAX_LEARNER_RESTARTS:
-            raise RunFailedError(
-                f"the learner was lost {self._learner_restarts} times, last: {error}; --resume goes on"
-            )
-        self._learning.kill()
-        learner = self._launch_learner()
-        folder = self._run / "checkpoints"
-        found = folder if any(folder.glob("updates-*")) else None
-        learner.call("begin", *self._sources, found, timeout_s=LONG_S)
-        status = learner.status()
-        # What was granted and is lost with the process is due again.
-        self._counts.refund_updates(self._counts.status().updates - status.updates)
-        learner.call("connect", self._replay_client(), timeout_s=LONG_S)
-        learner.call("start", timeout_s=LONG_S)
-        return status
+        return ReplayClient(self._shards, role_seed(self._config.seed, Role.REPLAY, 0, self._learning.num_restarts))
 
     def _report(self, reporter: Reporter, status: LearnerStatus) -> TrainReport:
         supervisor, counts = self._workers.supervisor, self._counts.status()
@@ -320,7 +311,11 @@ class RayBackend:
             supervisor.restarts,
             self._watch.num_restarts,
         )
-        metrics["learner_restarts_total/crash"] = float(self._learner_restarts)
+        metrics["learner_restarts_total/crash"] = float(self._learning.num_restarts)
+        if self._inference is not None:
+            metrics |= reporter.of_inference(self._inference.poll(), self._inference.num_restarts)
+        metrics["worker_nonfinite_total"] = float(supervisor.num_rejected)
+        metrics["worker_cut_episodes_total"] = float(supervisor.num_cut_episodes)
         episodes = tuple(self._counts.take_episodes())
         return TrainReport(env_steps=counts.env_steps, updates=status.updates, metrics=metrics, episodes=episodes)
 

@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from slotfilm_dist.backend import Player
-from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError, RunFailedError
+from slotfilm_dist.backend import Player, RunFailedError
+from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
 from slotfilm_dist.cluster.messages import AgentSetup
 from slotfilm_dist.cluster.role_clients import PlayerClient
 from slotfilm_dist.config import RunConfig

@@ -1,10 +1,6 @@
 """What can go wrong with a role, told in one line. Free of Ray, so that a command can catch it."""
 
 
-class RunFailedError(RuntimeError):
-    """The run cannot go on; the message names the cause and the remedy."""
-
-
 class RoleLostError(Exception):
     """The process of a role is gone.
 

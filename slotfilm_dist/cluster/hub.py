@@ -41,12 +41,14 @@ class Hub:
         limiter: of the run.
         total_steps: no more are admitted once so many are.
         num_workers: wanted at first.
+        auto_workers: the run changes that number by itself.
     """
 
-    def __init__(self, limiter: RateLimiter, total_steps: int, num_workers: int) -> None:
+    def __init__(self, limiter: RateLimiter, total_steps: int, num_workers: int, *, auto_workers: bool = False) -> None:
         self._limiter = limiter
         self._total_steps = total_steps
         self._lock = threading.Lock()
+        self._newer = threading.Condition(self._lock)
         self._pending: dict[BlockKey, BlockNotice] = {}
         self._gone: dict[int, int] = {}
         self._steps_by_worker: dict[int, int] = {}
@@ -56,23 +58,21 @@ class Hub:
         self._snapshot: WeightSnapshot | None = None
         self._setup: AgentSetup | None = None
         self._num_blocks = self._num_refunded_steps = self._num_published = 0
-        self._wanted_workers = num_workers
+        self._wanted_workers, self._auto_workers = num_workers, auto_workers
         self._alive_workers = 0
 
-    def admit_steps(
-        self, notice: BlockNotice, stored: Iterable[BlockKey], held_version: int, timeout_s: float
-    ) -> StepGrant:
+    def admit_steps(self, notice: BlockNotice, stored: Iterable[BlockKey], timeout_s: float) -> StepGrant:
         """Wait until a block's steps fit; asked again for the same block, they are not counted again.
 
         Args:
             notice: the block that is to be stored.
             stored: earlier blocks of the same worker that are in replay by now.
-            held_version: of the worker's weights.
             timeout_s: longest wait.
         """
         self.confirm(stored)
         with self._lock:
-            self._acting[notice.key.worker_id] = (held_version, self._published.get(held_version, time.time()))
+            version = notice.policy_version
+            self._acting[notice.key.worker_id] = (version, self._published.get(version, time.time()))
             known = notice.key in self._pending
         waited_s, waiting_for, granted = 0.0, "", known
         if not known and not self.finished:
@@ -85,7 +85,6 @@ class Hub:
             waited_s=waited_s,
             waiting_for=waiting_for,
             finished=not granted and self.finished,
-            snapshot=self.latest(held_version),
         )
 
     def _note_granted(self, notice: BlockNotice) -> bool:
@@ -181,6 +180,13 @@ class Hub:
             self._published[snapshot.version] = snapshot.published_at_s
             for version in sorted(self._published)[:-1000]:
                 del self._published[version]
+            self._newer.notify_all()
+
+    def await_newer(self, newer_than: int, timeout_s: float) -> WeightSnapshot | None:
+        """The newest weights, as soon as there are some newer than a version; None when time runs out."""
+        with self._newer:
+            self._newer.wait_for(lambda: self._snapshot is not None and self._snapshot.version > newer_than, timeout_s)
+        return self.latest(newer_than)
 
     def latest(self, newer_than: int) -> WeightSnapshot | None:
         """The newest weights, or None while there are none newer than the given version."""
@@ -203,11 +209,22 @@ class Hub:
         return self._setup
 
     def want_workers(self, num_workers: int) -> None:
-        """Ask for another number of workers; the supervisor starts or stops them."""
+        """Ask for a number of workers, kept from now on; the supervisor starts or stops them."""
         if num_workers < 1:
             raise ValueError(f"workers = {num_workers}: must be 1 or more")
         with self._lock:
-            self._wanted_workers = num_workers
+            self._wanted_workers, self._auto_workers = num_workers, False
+
+    def want_auto_workers(self) -> None:
+        """Let the run decide from now on how many workers it needs."""
+        with self._lock:
+            self._auto_workers = True
+
+    def adapt_workers(self, num_workers: int) -> None:
+        """The run's own decision; somebody who has asked for a number meanwhile keeps it."""
+        with self._lock:
+            if self._auto_workers:
+                self._wanted_workers = num_workers
 
     def note_alive(self, num_workers: int) -> None:
         """The supervisor says how many workers run."""
@@ -249,6 +266,7 @@ class Hub:
                 weights_age_s=sum(s for _, s in ages) / len(ages) if ages else 0.0,
                 steps_by_worker=dict(self._steps_by_worker),
                 wanted_workers=self._wanted_workers,
+                auto_workers=self._auto_workers,
                 alive_workers=self._alive_workers,
                 finished=limiter.env_steps - under_way >= self._total_steps,
             )

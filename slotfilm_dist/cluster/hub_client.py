@@ -1,6 +1,6 @@
 """The hub as the other roles see it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from slotfilm_dist.cluster.actors import HubActor
@@ -17,20 +17,21 @@ class HubClient:
         self._link = link
 
     @classmethod
-    def launch(cls, config: RunConfig, namespace: str) -> "HubClient":
-        """Start the hub under its name, so that `slotfilm scale` finds it."""
-        return cls(ActorLink.launch(HubActor, "hub", config, num_cpus=0, registered="hub", namespace=namespace))
+    def launch(cls, config: RunConfig, namespace: str, resources: Mapping[str, float]) -> "HubClient":
+        """Start the hub under its name, so that `slotfilm scale` finds it, where there are these Ray resources."""
+        link = ActorLink.launch(
+            *(HubActor, "hub", config), registered="hub", namespace=namespace, num_cpus=0, resources=dict(resources)
+        )
+        return cls(link)
 
     @classmethod
     def find(cls, namespace: str) -> "HubClient":
         """The hub of a live run; raises ``ValueError`` if there is none."""
         return cls(ActorLink.find("hub", namespace))
 
-    def admit_steps(
-        self, notice: BlockNotice, stored: Iterable[BlockKey], held_version: int, timeout_s: float
-    ) -> StepGrant:
+    def admit_steps(self, notice: BlockNotice, stored: Iterable[BlockKey], timeout_s: float) -> StepGrant:
         """Wait until a block's steps fit."""
-        reference = self._link.begin("admit_steps", notice, list(stored), held_version, timeout_s)
+        reference = self._link.begin("admit_steps", notice, list(stored), timeout_s)
         return self._link.answer(reference, "admission of a block", timeout_s + ANSWER_S)
 
     def admit_updates(self, max_updates: int, timeout_s: float) -> UpdateGrant:
@@ -40,7 +41,14 @@ class HubClient:
 
     def publish(self, snapshot: WeightSnapshot) -> None:
         """Send the newest weights; does not wait."""
-        self._link.begin("call", "publish", snapshot)
+        self._link.begin("publish", snapshot)
+
+    def await_newer(self, newer_than: int, timeout_s: float) -> WeightSnapshot | None:
+        """The newest weights, as soon as there are some newer than a version; None when time runs out."""
+        shared = self._link.answer(
+            self._link.begin("await_newer", newer_than, timeout_s), "newer weights", timeout_s + ANSWER_S
+        )
+        return self._link.answer(shared[0], "published weights", ANSWER_S) if shared else None
 
     def confirm(self, stored: Iterable[BlockKey]) -> None:
         """Note that blocks are in replay."""
@@ -91,8 +99,16 @@ class HubClient:
         return self._call("agent_setup")
 
     def want_workers(self, num_workers: int) -> None:
-        """Ask for another number of workers."""
+        """Ask for a number of workers, kept from now on."""
         self._call("want_workers", num_workers)
+
+    def want_auto_workers(self) -> None:
+        """Let the run decide from now on how many workers it needs."""
+        self._call("want_auto_workers")
+
+    def adapt_workers(self, num_workers: int) -> None:
+        """The run's own decision."""
+        self._call("adapt_workers", num_workers)
 
     def note_alive(self, num_workers: int) -> None:
         """Say how many workers run."""

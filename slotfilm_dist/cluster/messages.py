@@ -1,10 +1,13 @@
 """What the roles on a cluster tell each other beside blocks, batches and weights."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float16, Float32, Shaped, UInt8
 
-from slotfilm_dist.messages import EpisodeSummary, WeightSnapshot
+from slotfilm_dist.messages import EpisodeSummary
+from slotfilm_dist.replay.schema import ReplaySchema
 from slotfilm_dist.replay.shard import ShardStats
 
 
@@ -40,8 +43,6 @@ class StepGrant:
     """What was still missing when time ran out; empty if granted."""
     finished: bool
     """The run has all its steps: stop collecting."""
-    snapshot: WeightSnapshot | None
-    """Newer weights than the worker's, if there are any."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -86,6 +87,8 @@ class HubStatus:
     steps_by_worker: dict[int, int]
     """Steps stored, by worker."""
     wanted_workers: int
+    auto_workers: bool
+    """The run itself decides how many workers are wanted."""
     alive_workers: int
     finished: bool
     """All steps of the run are stored."""
@@ -112,12 +115,62 @@ class WorkerBeat:
     """Time spent waiting for the limiter and replay."""
     step_s: float
     """Mean time of one environment step in the last block, acting included."""
+    weights_lags_s: tuple[float, ...] = ()
+    """Times from a publication of weights until they acted here, since the last beat."""
+    num_rejected: int = 0
+    """Steps of this incarnation that were not finite or showed nothing, and were left out."""
+    num_cut_episodes: int = 0
+    """Episodes of this incarnation that ended with such a step."""
     error: str = ""
     """Why it stopped, in one line; empty while it runs."""
     error_reason: str = ""
     """The reason by the metric catalogue's words; empty while it runs."""
     running: bool = False
     """Its loop runs."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class InferenceRequest:
+    """What a worker sees, to be acted on elsewhere."""
+
+    worker_id: int
+    rgb: UInt8[np.ndarray, "envs height width 3"] | None
+    """Pictures; None without a camera, or where `visual` is sent instead."""
+    visual: Shaped[np.ndarray, "envs *visual"] | None
+    """What replay keeps of the pictures, where that is known already."""
+    proprio: Float32[np.ndarray, "envs proprio"]
+    goal: Float32[np.ndarray, "envs 3"]
+    noise: Float32[np.ndarray, "envs action"]
+    """Standard normal noise of the action, drawn by the worker."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class InferenceAnswer:
+    """Tokens and actions for an `InferenceRequest`."""
+
+    tokens: Float16[np.ndarray, "envs tokens dim"] | None
+    """None where the agent keeps pictures or has none, or where the request brought tokens."""
+    action: Float32[np.ndarray, "envs action"]
+    policy_version: int
+    backbone_hash: str
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class InferenceStatus:
+    """What the inference process says when it is asked how it does."""
+
+    policy_version: int
+    """-1 before the first weights."""
+    num_requests: int
+    num_steps: int
+    """Observations answered."""
+    num_batches: int
+    busy_s: float
+    """Time spent computing."""
+    weights_lags_s: tuple[float, ...]
+    """Times from a publication of weights until they acted here, since the last status."""
+    starts: str
+    """Changes whenever the process is another one."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -131,6 +184,20 @@ class ShardBeat:
     """Steps taken from a snapshot when it started."""
     snapshot_error: str = ""
     """Why the last snapshot could not be written or read."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LearnerBeginning:
+    """What a learner says when it is ready to train."""
+
+    values: dict[str, Any]
+    """Plain values of the checkpoint that it continues; empty for a fresh start."""
+    problems: tuple[str, ...]
+    """Newer checkpoints that could not be read, and why."""
+    schema: ReplaySchema
+    """How replay stores this agent's transitions."""
+    random_steps: int
+    """Steps of the random policy's data."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -2,13 +2,19 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.replay.memory import check_memory
 
 SHARES = (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.02, 0.01)
 """Cores that a role may ask for. Below 1, roles share cores: a laptop runs everything, only slower."""
+WORKER_RESOURCE = "slotfilm_worker"
+"""Ray resource that nodes offer where workers shall run, such as spot machines; any node will do while none does."""
+STATE_RESOURCE = "slotfilm_state"
+"""Ray resource that nodes offer where hub, shards and learner shall run; any node will do while none does."""
+TOKEN = 0.001
+"""How much of such a resource a role takes: next to nothing, only to be there."""
 OTHER_ROLES = 2
 """Roles beside the workers that ask for a share: the learner and an evaluation player. Hub and shards ask for none."""
 
@@ -18,9 +24,19 @@ class Placement:
     """What the roles ask Ray for."""
 
     share_cpus: float
-    """Cores of each worker, of the learner and of each player."""
+    """Cores of each worker and of each player."""
     gpu: bool
-    """The learner gets a GPU."""
+    """The learner computes on a GPU."""
+    learner_cpus: float
+    """Cores of the learner."""
+    learner_gpus: float
+    """GPUs of the learner, also a part of one; 0 without."""
+    central_inference: bool = False
+    """One process acts for all workers."""
+    inference_gpus: float = 0.0
+    """GPUs of that process."""
+    state_resources: Mapping[str, float] = field(default_factory=dict)
+    """What roles ask for beside that hold what must not be lost: hub, shards, learner, central inference."""
 
 
 def plan(config: RunConfig, nodes: Sequence[Mapping[str, float]]) -> Placement:
@@ -41,15 +57,47 @@ def plan(config: RunConfig, nodes: Sequence[Mapping[str, float]]) -> Placement:
         raise ValueError(
             "runtime.device = 'cuda': no node of this Ray cluster has a GPU; use --runtime.device cpu or auto"
         )
-    num_roles = config.runtime.num_workers + OTHER_ROLES
+    gpu = wants_gpu or (config.runtime.device == "auto" and num_gpus >= 1)
+    central = infers_centrally(config, gpu=gpu)
+    # The learner and central inference share the only GPU there is.
+    gpu_share = 0.0 if not gpu else 0.5 if central and num_gpus < 2 else 1.0
+    num_roles = config.runtime.num_workers + OTHER_ROLES + central
     cpus = [node.get("CPU", 0.0) for node in nodes]
+    needs = (
+        (nodes, num_roles),
+        (nodes_for(nodes, WORKER_RESOURCE), config.runtime.num_workers),
+        (nodes_for(nodes, STATE_RESOURCE), 1 + central),
+    )
     for share in SHARES:
-        if sum(math.floor(c / share + 1e-9) for c in cpus) >= num_roles:
-            return Placement(share_cpus=share, gpu=wants_gpu or (config.runtime.device == "auto" and num_gpus >= 1))
+        if all(sum(math.floor(n.get("CPU", 0.0) / share + 1e-9) for n in on) >= num for on, num in needs):
+            return Placement(
+                share_cpus=share,
+                gpu=gpu,
+                learner_cpus=share,
+                learner_gpus=gpu_share,
+                central_inference=central,
+                inference_gpus=gpu_share if central else 0.0,
+            )
     raise ValueError(
         f"runtime.num_workers = {config.runtime.num_workers}: this Ray cluster has {sum(cpus):g} cores; "
         f"it holds at most {max(0, math.floor(sum(cpus) / SHARES[-1]) - OTHER_ROLES)} workers"
     )
+
+
+def nodes_for(nodes: Sequence[Mapping[str, float]], resource: str) -> Sequence[Mapping[str, float]]:
+    """The nodes that offer a resource; all of them where none does."""
+    return [node for node in nodes if resource in node] or nodes
+
+
+def place(nodes: Sequence[Mapping[str, float]], resource: str) -> dict[str, float]:
+    """What to ask for to be put onto a node that offers a resource; nothing where none does."""
+    return {resource: TOKEN} if any(resource in node for node in nodes) else {}
+
+
+def infers_centrally(config: RunConfig, *, gpu: bool) -> bool:
+    """Whether one process acts for all workers: as the config says, else where it pays, on a GPU with pictures."""
+    chosen = config.runtime.inference
+    return chosen == "central" or (chosen == "auto" and gpu and config.encoder.uses_image)
 
 
 def share_for_more(num_workers: int, available_cpus: float) -> float:

@@ -1,7 +1,7 @@
 """The replay shards as the other roles see them: each of its own, or all as one store."""
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,13 +40,21 @@ class ShardClient:
 
     @classmethod
     def launch(
-        cls, config: RunConfig, schema: ReplaySchema, index: int, folder: Path, *, resume: bool
+        cls,
+        config: RunConfig,
+        schema: ReplaySchema,
+        index: int,
+        folder: Path,
+        *,
+        resume: bool,
+        resources: Mapping[str, float],
     ) -> "ShardClient":
-        """Start a shard; Ray replaces its process when it dies."""
+        """Start a shard where there are these Ray resources; Ray replaces its process when it dies."""
         link = ActorLink.launch(
             *(ShardActor, f"shard {index}", config, schema, index, folder),
             keywords={"resume": resume},
             num_cpus=0,
+            resources=dict(resources),
             max_restarts=SHARD_RESTARTS,
             max_task_retries=0,
         )

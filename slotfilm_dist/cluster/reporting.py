@@ -1,10 +1,12 @@
 """Turns the counters of all roles into the metrics of one report."""
 
+import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 
-from slotfilm_dist.cluster.messages import HubStatus, LearnerStatus, ShardBeat, WorkerBeat
+from slotfilm_dist.cluster.messages import HubStatus, InferenceStatus, LearnerStatus, ShardBeat, WorkerBeat
 from slotfilm_dist.config import RunConfig
+from slotfilm_dist.contracts import MetricSink
 
 
 class Reporter:
@@ -53,15 +55,33 @@ class Reporter:
         self._last = now, hub, learner, waited_s
         return values
 
+    def of_inference(self, status: InferenceStatus | None, num_restarts: int) -> dict[str, float]:
+        """Metrics of central inference; what it would tell itself is missing while it does not answer."""
+        if status is None:
+            return {"inference_restarts_total/crash": float(num_restarts)}
+        values = {
+            "inference_steps_total": float(status.num_steps),
+            "inference_busy_s_total": status.busy_s,
+            "inference_batch_steps": status.num_steps / max(1, status.num_batches),
+            "inference_restarts_total/crash": float(num_restarts),
+        }
+        if status.weights_lags_s:
+            values["weights_apply_s"] = statistics.median(status.weights_lags_s)
+        return values
+
     def _of_workers(self, hub: HubStatus, workers: Sequence[WorkerBeat], waited_s: float) -> dict[str, float]:
         by_worker = list(hub.steps_by_worker.values())
         values = {
             "worker_env_steps_total": float(hub.env_steps),
             "worker_blocks_total": float(hub.num_blocks),
             "worker_alive_count": float(hub.alive_workers),
+            "worker_wanted_count": float(hub.wanted_workers),
             "worker_wait_s_total": waited_s,
         }
         stepping = [beat.step_s for beat in workers if beat.step_s]
+        lags = [lag_s for beat in workers for lag_s in beat.weights_lags_s]
+        if lags:
+            values["weights_apply_s"] = statistics.median(lags)
         if stepping:
             values["worker_sim_s"] = sum(stepping) / len(stepping)
         if by_worker:
@@ -98,6 +118,37 @@ class Reporter:
             "weights_age_s": hub.weights_age_s,
             "weights_published_total": float(hub.num_published),
         }
+
+
+class WorkerMetrics:
+    """Writes one worker's own metrics where its process exports them.
+
+    Args:
+        sink: takes them.
+    """
+
+    def __init__(self, sink: MetricSink) -> None:
+        self._sink = sink
+        self._steps_before = self._blocks_before = 0
+        self._last: WorkerBeat | None = None
+
+    def note(self, beat: WorkerBeat) -> None:
+        """Write what changed since the last beat; counts go on over the incarnations of the process."""
+        last = self._last
+        if last is not None and beat.incarnation != last.incarnation:
+            self._steps_before += last.num_steps
+            self._blocks_before += last.num_blocks
+        values = {
+            "worker_env_steps_total": float(self._steps_before + beat.num_steps),
+            "worker_blocks_total": float(self._blocks_before + beat.num_blocks),
+            "worker_wait_s_total": beat.waited_s,
+        }
+        if last is None or beat.num_blocks != last.num_blocks:
+            values |= {"worker_sim_s": beat.step_s} if beat.step_s else {}
+        self._last = beat
+        self._sink.write(values)
+        for lag_s in beat.weights_lags_s:
+            self._sink.write({"weights_apply_s": lag_s})
 
 
 def _share(value: float) -> float:

@@ -1,7 +1,7 @@
 """Workers, learner and evaluation players as the driver sees them."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ from slotfilm_dist.cluster.actors import LearnerActor, PlayerActor, WorkerActor
 from slotfilm_dist.cluster.clients import ANSWER_S, ActorLink, is_ready
 from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
 from slotfilm_dist.cluster.hub_client import HubClient
+from slotfilm_dist.cluster.inference_client import InferenceClient
 from slotfilm_dist.cluster.messages import AgentSetup, LearnerStatus, WorkerBeat
 from slotfilm_dist.cluster.replay_client import ReplayClient
 from slotfilm_dist.config import RunConfig
@@ -27,17 +28,30 @@ class WorkerClient:
 
     @classmethod
     def launch(
-        cls, config: RunConfig, worker_id: int, make_env: Callable[..., Any], limits: Any, num_cpus: float
+        cls,
+        config: RunConfig,
+        worker_id: int,
+        make_env: Callable[..., Any],
+        limits: Any,
+        num_cpus: float,
+        resources: Mapping[str, float],
+        labels: Mapping[str, str],
     ) -> "WorkerClient":
-        """Start a worker's process; it does nothing yet."""
-        name = f"worker {worker_id}"
-        arguments = (config, worker_id, make_env, limits)
-        return cls(ActorLink.launch(WorkerActor, name, *arguments, num_cpus=num_cpus, max_restarts=0), worker_id)
+        """Start a worker's process where there are these Ray resources; it does nothing yet.
 
-    def train(self, incarnation: int, hub: HubClient, store: ReplayClient, setup: AgentSetup) -> None:
-        """Start collecting for replay; does not wait."""
+        `labels` are those of its metrics; empty for none.
+        """
+        name = f"worker {worker_id}"
+        arguments = (config, worker_id, make_env, limits, labels)
+        link = ActorLink.launch(
+            *(WorkerActor, name, *arguments), num_cpus=num_cpus, resources=dict(resources), max_restarts=0
+        )
+        return cls(link, worker_id)
+
+    def train(self, incarnation: int, hub: HubClient, store: ReplayClient, agent: AgentSetup | InferenceClient) -> None:
+        """Start collecting for replay, acting with an agent here or where one acts for all; does not wait."""
         self._last = None
-        self._link.begin("train", incarnation, hub, store, setup)
+        self._link.begin("train", incarnation, hub, store, agent)
 
     def collect_randomly(self, incarnation: int) -> None:
         """Start collecting with the random policy; does not wait."""
@@ -107,14 +121,23 @@ class LearnerClient:
 
     @classmethod
     def launch(
-        cls, config: RunConfig, action_dim: int, num_threads: int, hub: HubClient, *, num_cpus: float, gpu: bool
+        cls,
+        config: RunConfig,
+        action_dim: int,
+        num_threads: int,
+        hub: Any,
+        *,
+        num_cpus: float,
+        num_gpus: float,
+        resources: Mapping[str, float],
     ) -> "LearnerClient":
-        """Start the learner's process."""
+        """Start the learner's process; `hub` is an `UpdateLink`."""
         link = ActorLink.launch(
             *(LearnerActor, "learner", config, action_dim, num_threads),
-            keywords={"gpu": gpu, "hub": hub},
+            keywords={"gpu": num_gpus > 0, "hub": hub},
             num_cpus=num_cpus,
-            num_gpus=1 if gpu else 0,
+            num_gpus=num_gpus,
+            resources=dict(resources),
             max_restarts=0,
         )
         return cls(link)

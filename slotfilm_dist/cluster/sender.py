@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
 from slotfilm_dist.cluster.messages import BlockKey, BlockNotice, StepGrant
-from slotfilm_dist.messages import TransitionBlock, WeightSnapshot
+from slotfilm_dist.messages import TransitionBlock
 
 ADMIT_S = 1.0
 """Longest wait of one request to the limiter."""
@@ -22,18 +22,12 @@ MAX_PARKED = 32
 class HubLink(Protocol):
     """What a worker asks of the hub."""
 
-    def admit_steps(
-        self, notice: BlockNotice, stored: Iterable[BlockKey], held_version: int, timeout_s: float
-    ) -> StepGrant:
+    def admit_steps(self, notice: BlockNotice, stored: Iterable[BlockKey], timeout_s: float) -> StepGrant:
         """Wait until a block's steps fit."""
         ...
 
     def confirm(self, stored: Iterable[BlockKey]) -> None:
         """Note that blocks are in replay."""
-        ...
-
-    def latest(self, newer_than: int) -> WeightSnapshot | None:
-        """The newest weights."""
         ...
 
 
@@ -53,8 +47,8 @@ class StoreLink(Protocol):
 class BlockSender:
     """Asks the limiter for each block, then stores it, in a thread of its own.
 
-    Consumes blocks, one waiting and one under way; produces stored blocks, and weights that came with an answer. Waits
-    for the limiter, then for the block's shard. Blocks for a shard that does not answer are parked, up to `MAX_PARKED`,
+    Consumes blocks, one waiting and one under way; produces stored blocks. Waits for the limiter, then for the block's
+    shard. Blocks for a shard that does not answer are parked, up to `MAX_PARKED`,
     and a second thread offers them until it answers, so that the other shards go on being filled; the same block is
     stored once. Ends when closed, when the run has all its steps, or when the hub is gone.
 
@@ -71,8 +65,6 @@ class BlockSender:
         self._closing = threading.Event()
         self._stored_lock = threading.Lock()
         self._stored: list[BlockKey] = []
-        self._snapshot: WeightSnapshot | None = None
-        self._held_version = -1
         self._waiting_for = "room for a block"
         self._error: Exception | None = None
         self.finished = False
@@ -95,17 +87,6 @@ class BlockSender:
         except queue.Full:
             return False
         return True
-
-    def newest(self, held_version: int) -> WeightSnapshot | None:
-        """Weights newer than those held; asks the hub only for the very first ones."""
-        self._held_version = held_version
-        if self._snapshot is None and held_version < 0:
-            self._snapshot = self._hub.latest(held_version)
-        snapshot = self._snapshot
-        if snapshot is None or snapshot.version <= held_version:
-            return None
-        self._held_version = snapshot.version
-        return snapshot
 
     def waiting_for(self) -> str:
         """What it waits for now."""
@@ -135,9 +116,7 @@ class BlockSender:
             key=_key(block), num_steps=block.num_steps, policy_version=block.policy_version, episodes=block.episodes
         )
         while not self._closing.is_set():
-            grant = self._hub.admit_steps(notice, self._take_stored(), self._held_version, ADMIT_S)
-            if grant.snapshot is not None:
-                self._snapshot = grant.snapshot
+            grant = self._hub.admit_steps(notice, self._take_stored(), ADMIT_S)
             if grant.finished:
                 self.finished = True
                 return False

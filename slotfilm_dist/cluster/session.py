@@ -8,21 +8,28 @@ import re
 import secrets
 import shutil
 import signal
+import socket
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import psutil
 import ray
+from ray._private import ray_constants
 
 from slotfilm_dist.atomic import write_atomic
-from slotfilm_dist.cluster.failures import RunFailedError
+from slotfilm_dist.backend import RunFailedError
+from slotfilm_dist.cluster.placement import place
 from slotfilm_dist.machine import usable_cores, usable_memory_bytes
 
 STORE_BYTES = 1 << 30
 """Object store of a private cluster: only blocks, batches and weights under way live there."""
 START_ATTEMPTS = 3
 """Ray gives its own processes half a minute to start, which a loaded machine may miss."""
+PORTS_TRIED = 32
+FOLDER_PREFIX, OWNER_FILE = "slotfilm-", "owner"
+"""A private cluster's folder, and the file in it that names the driver's process."""
 CLUSTER_FILE = "cluster.json"
 """In the run directory: how `slotfilm scale` finds the run."""
 
@@ -32,18 +39,21 @@ class Session:
 
     With `RAY_ADDRESS` set, as inside a Ray job, or where Ray is connected already, as inside a Tune trial, that cluster
     is used and left running. Otherwise a private one is started, without a dashboard or usage reports, with a token of
-    its own (unless `RAY_AUTH_MODE` says otherwise) in a folder that nobody else can read. Ray may still listen on the
-    machine's own address: the token, not the address, keeps others out.
+    its own (unless `RAY_AUTH_MODE` says otherwise) in a folder that nobody else can read. It listens on the loopback
+    only, so that nobody reaches it from another machine, and the token keeps this machine's other users out.
 
     Args:
         num_cpus: cores of a private cluster; 0 takes all that may be used.
+        metrics_port: where a private cluster serves metrics to Prometheus, or at a later port while others use that
+            one; 0 leaves the choice to Ray.
     """
 
-    def __init__(self, num_cpus: int = 0) -> None:
+    def __init__(self, num_cpus: int = 0, metrics_port: int = 0) -> None:
         self.private = False
         self._joined = False
         self._folder: Path | None = None
         self._environment: dict[str, str | None] = {}
+        self._loopback = contextlib.ExitStack()
         if ray.is_initialized():
             return
         self._joined = True
@@ -51,7 +61,7 @@ class Session:
             if os.environ.get("RAY_ADDRESS"):
                 ray.init(address=os.environ["RAY_ADDRESS"], log_to_driver=False, logging_level=logging.ERROR)
             else:
-                self._start_private(num_cpus or max(1, int(usable_cores())))
+                self._start_private(num_cpus or max(1, int(usable_cores())), metrics_port)
 
     @property
     def address(self) -> str:
@@ -67,13 +77,31 @@ class Session:
         """Resources of every live node."""
         return [node["Resources"] for node in ray.nodes() if node["Alive"]]
 
+    def metric_pages(self) -> list[str]:
+        """Where Prometheus finds the metrics of every live node."""
+        nodes = [node for node in ray.nodes() if node["Alive"] and node["MetricsExportPort"] > 0]
+        return [f"http://{node['NodeManagerAddress']}:{node['MetricsExportPort']}/metrics" for node in nodes]
+
+    def place(self, resource: str) -> dict[str, float]:
+        """What a role asks for to be put onto a live node that offers a resource; nothing where none does.
+
+        Nor in a placement group, such as a Tune trial's, which offers nothing but its bundles.
+        """
+        return {} if ray.util.get_current_placement_group() is not None else place(self.nodes(), resource)
+
     def available_cpus(self) -> float:
         """Cores that nobody has asked for."""
         return float(ray.available_resources().get("CPU", 0.0))
 
     def write_cluster_file(self, run: Path, namespace: str, starts: int) -> None:
         """Note in the run directory where the run lives, and how often it has been started, this time included."""
-        values = {"address": self.address, "namespace": namespace, "token_path": self.token_path, "starts": starts}
+        values = {
+            "address": self.address,
+            "namespace": namespace,
+            "token_path": self.token_path,
+            "metrics": self.metric_pages(),
+            "starts": starts,
+        }
         write_atomic(run / CLUSTER_FILE, [json.dumps(values, indent=1).encode()])
 
     def close(self) -> None:
@@ -82,6 +110,7 @@ class Session:
             return
         ray.shutdown()
         self._joined = False
+        self._loopback.close()
         for name, value in self._environment.items():
             if value is None:
                 os.environ.pop(name, None)
@@ -90,11 +119,15 @@ class Session:
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
 
-    def _start_private(self, num_cpus: int) -> None:
+    def _start_private(self, num_cpus: int, metrics_port: int) -> None:
         self.private = True
         # A short path: the sockets below it may have no more than 107 characters.
-        self._folder = Path(tempfile.mkdtemp(prefix="slotfilm-"))
+        remove_stale_folders(Path(tempfile.gettempdir()))
+        self._folder = Path(tempfile.mkdtemp(prefix=FOLDER_PREFIX))
+        (self._folder / OWNER_FILE).write_text(_process_name(os.getpid()))
         self._set("RAY_USAGE_STATS_ENABLED", "0")
+        self._set(ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR, "0")
+        self._loopback.enter_context(_on_loopback())
         if not os.environ.get("RAY_AUTH_MODE"):
             token = self._folder / "token"
             token.touch(mode=0o600)
@@ -103,7 +136,8 @@ class Session:
             self._environment.setdefault("RAY_AUTH_MODE", None)  # Ray turns it on by itself where a token is there
         for attempt in range(START_ATTEMPTS):
             try:
-                self._init(num_cpus)
+                # Should somebody else take that port in the same instant, the next attempt leaves the choice to Ray.
+                self._init(num_cpus, free_port(metrics_port) if metrics_port and attempt == 0 else 0)
                 return
             except Exception as error:  # Ray raises plain Exceptions when a process of its own starts too slowly
                 ray.shutdown()
@@ -114,7 +148,7 @@ class Session:
                         "is the machine overloaded? --runtime.mode local runs without Ray"
                     ) from error
 
-    def _init(self, num_cpus: int) -> None:
+    def _init(self, num_cpus: int, metrics_port: int) -> None:
         ray.init(
             num_cpus=num_cpus,
             object_store_memory=min(STORE_BYTES, usable_memory_bytes() // 4),
@@ -123,6 +157,7 @@ class Session:
             logging_level=logging.ERROR,
             _temp_dir=str(self._folder),
             _node_ip_address="127.0.0.1",
+            _metrics_export_port=metrics_port or None,
             # Roles at the usual priority: at Ray's own 15 anything else on the machine would starve them.
             _system_config={"agent_register_timeout_ms": 100_000, "worker_niceness": 0},
         )
@@ -134,6 +169,35 @@ class Session:
     @staticmethod
     def _environment_now(name: str) -> str:
         return os.environ.get(name, "")
+
+
+def free_port(first: int) -> int:
+    """The first port from `first` on that nobody listens at, among a few; 0 if there is none."""
+    for port in range(first, min(first + PORTS_TRIED, 65536)):
+        with contextlib.closing(socket.socket()) as candidate, contextlib.suppress(OSError):
+            candidate.bind(("", port))
+            return port
+    return 0
+
+
+def remove_stale_folders(parent: Path) -> int:
+    """Delete what private clusters have left whose driver was killed; gives how many there were."""
+    count = 0
+    for owner in parent.glob(f"{FOLDER_PREFIX}*/{OWNER_FILE}"):
+        with contextlib.suppress(OSError, ValueError):  # somebody else's, or just being deleted
+            name = owner.read_text()
+            if name and name != _process_name(int(name.split()[0])):
+                shutil.rmtree(owner.parent, ignore_errors=True)
+                count += 1
+    return count
+
+
+def _process_name(pid: int) -> str:
+    """A process beyond the reuse of its number: number and time of its start; empty if there is none."""
+    try:
+        return f"{pid} {psutil.Process(pid).create_time()}"
+    except psutil.Error:
+        return ""
 
 
 def namespace_of(run: Path) -> str:
@@ -163,8 +227,10 @@ def joined(run: Path) -> Iterator[str]:
     if values["token_path"]:
         os.environ["RAY_AUTH_TOKEN_PATH"] = values["token_path"]
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    here = _on_loopback() if values["address"].startswith("127.") else contextlib.nullcontext()
     try:
-        ray.init(address=values["address"], log_to_driver=False, logging_level=logging.ERROR)
+        with here:
+            ray.init(address=values["address"], log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(
@@ -174,6 +240,21 @@ def joined(run: Path) -> Iterator[str]:
         yield values["namespace"]
     finally:
         ray.shutdown()
+
+
+@contextlib.contextmanager
+def _on_loopback() -> Iterator[None]:
+    """Let Ray take 127.0.0.1 for a node's address while the body runs.
+
+    Otherwise it puts the machine's own address in its place and listens on every interface. Its switch for that is the
+    one by which it keeps a laptop's firewall quiet; Ray reads the variable when imported, so its value is set too.
+    """
+    before = ray_constants.ENABLE_RAY_CLUSTER
+    ray_constants.ENABLE_RAY_CLUSTER = False
+    try:
+        yield
+    finally:
+        ray_constants.ENABLE_RAY_CLUSTER = before
 
 
 @contextlib.contextmanager

@@ -4,15 +4,18 @@
     loop: step env, act  ---block--> sender         counts steps, updates        updater: update, update, ...
           ^ one block ready, one under way |        keeps newest weights           |  ^ chunk of batches
           |                                |--may I insert?--> limiter <--may I update?-- fetcher
-          '------- newer weights ----------'   (answer brings weights)  <--weights--'  | draws
+    follower: <-- newer weights, by a long poll -- newest weights  <----weights----'  | draws
                                            |                                           v
                                            '--------------block--------------> SHARD x M (process each)
     DRIVER (this process)
     pipeline: reports once a second, checkpoints, evaluates (PLAYERS, processes of their own)
     caretaker thread: `Supervisor.tick` and `ShardWatch.tick` four times a second
+    INFERENCE (process, where it is central): sees for all workers, answers with tokens and actions; follows weights
 
     loop       consumes         produces          waits for                       stops
-    worker     weights          blocks            room in its sender              between two steps
+    worker     actions          blocks            room in its sender              between two steps
+    follower   weights          an acting policy  a newer version                 within a second
+    batcher    observations     tokens, actions   a request; others, 5 ms         with its process
     sender     blocks           stored blocks     the limiter; a shard's answer   after its block
     fetcher    grants, replay   chunks            the limiter; replay's size      within half a second
     updater    chunks           updates, weights  a chunk                         after its update
@@ -30,7 +33,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
-from slotfilm_dist.cluster.failures import RoleLostError, RunFailedError
+from slotfilm_dist.backend import RunFailedError
+from slotfilm_dist.cluster.failures import RoleLostError
 from slotfilm_dist.cluster.messages import ShardBeat, WorkerBeat
 
 MAX_FAILURES = 5
@@ -48,7 +52,11 @@ class WorkerHandle(Protocol):
     """A worker's process as the supervisor needs it."""
 
     worker_id: int
-    silent_s: float
+
+    @property
+    def silent_s(self) -> float:
+        """Time since it last answered."""
+        ...
 
     def poll(self) -> WorkerBeat | None:
         """Its last beat; never waits; raises `RoleLostError` if the process is gone."""
@@ -103,6 +111,7 @@ class Supervisor:
         self._lock = threading.RLock()
         self._stopped = False
         self.restarts: Counter[str] = Counter()
+        self._rejected_before = self._cut_before = 0
         self.last_restart = ""
 
     @property
@@ -111,6 +120,16 @@ class Supervisor:
         with self._lock:
             members = self._members.values()
             return sum(m.beat is not None and m.beat.running and m.beat.incarnation == m.incarnation for m in members)
+
+    @property
+    def num_rejected(self) -> int:
+        """Steps that workers have left out, over all incarnations."""
+        return self._rejected_before + sum(beat.num_rejected for beat in self.beats())
+
+    @property
+    def num_cut_episodes(self) -> int:
+        """Episodes cut short by such a step, over all incarnations."""
+        return self._cut_before + sum(beat.num_cut_episodes for beat in self.beats())
 
     @property
     def handles(self) -> list[WorkerHandle]:
@@ -188,6 +207,7 @@ class Supervisor:
         worker_id, now = member.handle.worker_id, self._clock()
         member.handle.kill()
         self._settle(worker_id, member.incarnation)
+        self._retire(member)
         self.restarts[reason] += 1
         self.last_restart = f"worker {worker_id} ({reason}): {cause}"
         failures = [at for at in member.failures if now - at <= FAILURE_WINDOW_S] + [now]
@@ -205,6 +225,7 @@ class Supervisor:
         self._set_to_work(member)
 
     def _set_to_work(self, member: _Member) -> None:
+        self._retire(member)
         member.incarnation, member.employed_at, member.beat = self._next_incarnation, self._clock(), None
         self._next_incarnation += 1
         self._employ(member.handle, member.incarnation)
@@ -216,6 +237,14 @@ class Supervisor:
             member.handle.stopped(request, STOP_S)
             member.handle.kill()
             self._settle(member.handle.worker_id, member.incarnation)
+            self._retire(member)
+
+    def _retire(self, member: _Member) -> None:
+        """Add what an incarnation counted to what those before it had."""
+        if member.beat is not None:
+            self._rejected_before += member.beat.num_rejected
+            self._cut_before += member.beat.num_cut_episodes
+            member.beat = None
 
 
 @runtime_checkable

@@ -1,6 +1,5 @@
 """An environment worker: steps its environment with the newest policy and gets rid of blocks. Plain, without Ray."""
 
-import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -11,11 +10,14 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
+from slotfilm_dist.cluster.acting import ActingPolicy, FollowingPolicy, WeightLink
+from slotfilm_dist.cluster.central_policy import CentralPolicy, InferenceLink
 from slotfilm_dist.cluster.messages import AgentSetup, WorkerBeat
+from slotfilm_dist.cluster.outlet import Mailbox, Outlet
 from slotfilm_dist.cluster.sender import BlockSender, HubLink, StoreLink
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.contracts import VectorEnv
-from slotfilm_dist.messages import Observation, StepResult, TransitionBlock, WeightSnapshot
+from slotfilm_dist.messages import Observation, StepResult, TransitionBlock
 from slotfilm_dist.nets.agent import build_actor, build_encoder
 from slotfilm_dist.policy import AgentPolicy, Policy, RandomPolicy
 from slotfilm_dist.rollout import RolloutLoop
@@ -28,8 +30,14 @@ BUILD_LIMIT_S = 180.0
 """Longest time to build a simulator and its first episode."""
 STEP_LIMIT_S = 30.0
 """Longest time of one environment step, and between two signs of life while waiting."""
+CPU = torch.device("cpu")
 SLICE_S = 0.25
 """Waits are cut in slices of this length, so that a stop is noticed."""
+
+
+@runtime_checkable
+class WorkerHubLink(HubLink, WeightLink, Protocol):
+    """What a worker asks of the hub: that its blocks are admitted, and weights."""
 
 
 class Stopped(Exception):
@@ -44,84 +52,29 @@ class Limits:
     step_s: float = STEP_LIMIT_S
 
 
-@runtime_checkable
-class Outlet(Protocol):
-    """Where a worker's blocks go."""
-
-    finished: bool
-    """No more blocks are wanted."""
-
-    def offer(self, block: TransitionBlock, timeout_s: float) -> bool:
-        """Take a block, or say False while there is no room."""
-        ...
-
-    def newest(self, held_version: int) -> WeightSnapshot | None:
-        """Weights newer than those that the worker holds, if any have come."""
-        ...
-
-    def waiting_for(self) -> str:
-        """What it waits for now."""
-        ...
-
-    def close(self) -> None:
-        """Get rid of what was taken, and end."""
-        ...
-
-
-class Mailbox:
-    """Keeps the random policy's blocks until they are fetched."""
-
-    def __init__(self, num_blocks: int) -> None:
-        self._queue: queue.Queue[TransitionBlock] = queue.Queue(num_blocks)
-        self.finished = False
-
-    def offer(self, block: TransitionBlock, timeout_s: float) -> bool:
-        """Take a block, or say False while it is full."""
-        try:
-            self._queue.put(block, timeout=timeout_s)
-        except queue.Full:
-            return False
-        return True
-
-    def take(self, timeout_s: float) -> list[TransitionBlock]:
-        """All blocks that are there, at least one unless time runs out."""
-        blocks: list[TransitionBlock] = []
-        try:
-            blocks.append(self._queue.get(timeout=timeout_s))
-            while True:
-                blocks.append(self._queue.get_nowait())
-        except queue.Empty:
-            return blocks
-
-    def newest(self, held_version: int) -> WeightSnapshot | None:
-        """The random policy has no weights."""
-        return None
-
-    def waiting_for(self) -> str:
-        """The driver fetches the blocks."""
-        return "the driver to fetch the random policy's blocks"
-
-    def close(self) -> None:
-        """What was not fetched is dropped."""
-        self.finished = True
-
-
 def build_policy(
-    config: RunConfig, setup: AgentSetup, seed: np.random.SeedSequence, *, deterministic: bool = False
+    config: RunConfig,
+    setup: AgentSetup,
+    seed: np.random.SeedSequence,
+    *,
+    deterministic: bool = False,
+    device: torch.device = CPU,
 ) -> AgentPolicy:
-    """The agent's policy on a CPU, with the learner's own encoder; `load` gives it the newest weights."""
+    """The agent's policy, with the learner's own encoder; `load` gives it the newest weights."""
     encoder = build_encoder(config, fetch_weights=False)
     encoder.load_state_dict({name: torch.tensor(value) for name, value in setup.encoder.items()})
     if not config.sac.end_to_end:
         encoder.freeze_backbone()
     encoder.eval()
-    return AgentPolicy(encoder, build_actor(config, encoder, setup.action_dim), seed, deterministic=deterministic)
+    actor = build_actor(config, encoder, setup.action_dim)
+    return AgentPolicy(encoder.to(device), actor.to(device), seed, deterministic=deterministic)
 
 
 class WorkerLoop:
     """Steps one environment in a thread of its own.
 
-    Consumes weights; produces blocks of `runtime.block_steps` steps. Waits for its outlet to take a block: the limiter
+    Consumes weights, which its policy follows by itself; produces blocks of `runtime.block_steps` steps. Waits for its
+    outlet to take a block: the limiter
     and a shard in training, the driver while the random policy collects. Stops between two environment steps when told
     to (`stop`), when its outlet is finished, or on an error, which `beat` then names.
 
@@ -143,10 +96,11 @@ class WorkerLoop:
         self._stopping = threading.Event()
         self._mailbox: Mailbox | None = None
         self._sender: BlockSender | None = None
+        self._rollout: RolloutLoop | None = None
         self._incarnation = 0
         self._activity, self._limit_s, self._pulse_at = "nothing", self._limits.step_s, time.monotonic()
         self._num_steps = self._num_blocks = 0
-        self._version = -1
+        self._acting: ActingPolicy | None = None
         self._waited_s = self._step_s = 0.0
         self._error = self._error_reason = ""
 
@@ -164,12 +118,25 @@ class WorkerLoop:
         assert self._mailbox is not None, "collect_randomly comes first"
         return self._mailbox.take(timeout_s)
 
-    def train(self, incarnation: int, hub: HubLink, store: StoreLink, setup: AgentSetup) -> None:
-        """Start collecting with the trained agent for replay."""
+    def train(self, incarnation: int, hub: WorkerHubLink, store: StoreLink, agent: AgentSetup | InferenceLink) -> None:
+        """Start collecting with the trained agent for replay.
+
+        Args:
+            incarnation: of this worker.
+            hub: admits its blocks, has the weights.
+            store: takes its blocks.
+            agent: to act with, here, or the process that acts for it.
+        """
         sender = self._sender = BlockSender(hub, store)
+        seed = self._seed(Role.ACTIONS, incarnation)
 
         def policy(action_dim: int) -> Policy:
-            return build_policy(self._config, setup, self._seed(Role.ACTIONS, incarnation))
+            acting = self._acting = (
+                FollowingPolicy(build_policy(self._config, agent, seed), hub)
+                if isinstance(agent, AgentSetup)
+                else CentralPolicy(agent, self._worker_id, action_dim, seed, self._note_wait)
+            )
+            return acting
 
         self._start(incarnation, sender, policy, Role.EPISODES)
 
@@ -198,9 +165,12 @@ class WorkerLoop:
             idle_s=time.monotonic() - self._pulse_at,
             num_steps=self._num_steps,
             num_blocks=self._num_blocks,
-            policy_version=self._version,
+            policy_version=self._acting.version if self._acting else -1,
             waited_s=self._waited_s,
             step_s=self._step_s,
+            weights_lags_s=self._acting.take_lags_s() if self._acting else (),
+            num_rejected=self._rollout.num_rejected if self._rollout else 0,
+            num_cut_episodes=self._rollout.num_cut_episodes if self._rollout else 0,
             error=self._error,
             error_reason=self._error_reason,
             running=self._thread is not None and self._thread.is_alive(),
@@ -214,6 +184,7 @@ class WorkerLoop:
         self._stopping = threading.Event()
         self._incarnation = incarnation
         self._num_steps = self._num_blocks = 0
+        self._rollout = None
         self._error = self._error_reason = ""
         self._note("starting", self._limits.build_s)
         self._thread = threading.Thread(
@@ -226,13 +197,13 @@ class WorkerLoop:
 
     def _run(self, outlet: Outlet, make_policy: Callable[[int], Policy], seed: np.random.SeedSequence) -> None:
         try:
-            rollout, policy = self._build(make_policy, seed)
+            rollout = self._rollout = self._build(make_policy, seed)
+            self._await_weights()
             while not (self._stopping.is_set() or outlet.finished):
-                self._follow(outlet, policy)
                 began = time.monotonic()
                 block = rollout.collect(self._config.runtime.block_steps)
                 self._step_s = (time.monotonic() - began) / max(1, block.num_steps)
-                _require_finite(block)
+                _require_finite_actions(block)
                 self._hand_over(outlet, block)
         except Stopped:
             pass
@@ -241,30 +212,26 @@ class WorkerLoop:
             self._error_reason = "nonfinite" if isinstance(error, FloatingPointError) else "crash"
         finally:
             self._note("ending", self._limits.step_s)
+            if self._acting is not None:
+                self._acting.close()
             outlet.close()
 
-    def _build(self, make_policy: Callable[[int], Policy], seed: np.random.SeedSequence) -> tuple[RolloutLoop, Policy]:
+    def _build(self, make_policy: Callable[[int], Policy], seed: np.random.SeedSequence) -> RolloutLoop:
         if self._env is None:
             self._note("building the simulator", self._limits.build_s)
             self._env = self._make_env(self._config, self._config.encoder.uses_image)
             self._built.set()
         policy = make_policy(self._env.action_dim)
         self._note("starting the first episode", self._limits.build_s)
-        watched = _WatchedEnv(self._env, self._note_step)
-        return RolloutLoop(watched, policy, seed, self._worker_id, self._incarnation), policy
+        watched = _WatchedEnv(self._env, self._note_reset, self._note_step)
+        return RolloutLoop(watched, policy, seed, self._worker_id, self._incarnation)
 
-    def _follow(self, outlet: Outlet, policy: Policy) -> None:
-        """Take over newer weights where there are any; the trained agent does not act without."""
-        if isinstance(policy, AgentPolicy):
-            snapshot = outlet.newest(self._version)
-            while snapshot is None and self._version < 0:
-                self._note("waiting for the first weights", self._limits.step_s)
-                if self._stopping.wait(SLICE_S):
-                    raise Stopped
-                snapshot = outlet.newest(self._version)
-            if snapshot is not None:
-                policy.load(snapshot.version, snapshot.arrays)
-                self._version = snapshot.version
+    def _await_weights(self) -> None:
+        """The trained agent does not act before its first weights; newer ones come by themselves."""
+        while self._acting is not None and not self._acting.await_weights(SLICE_S):
+            self._note("waiting for the first weights", self._limits.step_s)
+            if self._stopping.is_set():
+                raise Stopped
 
     def _hand_over(self, outlet: Outlet, block: TransitionBlock) -> None:
         began = time.monotonic()
@@ -281,6 +248,15 @@ class WorkerLoop:
     def _note(self, activity: str, limit_s: float) -> None:
         self._activity, self._limit_s, self._pulse_at = activity, limit_s, time.monotonic()
 
+    def _note_wait(self, waiting_for: str) -> None:
+        self._note(f"waiting for {waiting_for}", self._limits.step_s)
+        if self._stopping.is_set():
+            raise Stopped
+
+    def _note_reset(self) -> None:
+        first = self._num_blocks == 0
+        self._note("starting an episode", self._limits.build_s if first else self._limits.step_s)
+
     def _note_step(self) -> None:
         self._note("stepping the environment", self._limits.step_s)
         if self._stopping.is_set():
@@ -288,16 +264,17 @@ class WorkerLoop:
 
 
 class _WatchedEnv:
-    """An environment that says when it begins a step."""
+    """An environment that says when it begins a reset or a step."""
 
-    def __init__(self, env: VectorEnv, note_step: Callable[[], None]) -> None:
+    def __init__(self, env: VectorEnv, note_reset: Callable[[], None], note_step: Callable[[], None]) -> None:
         self._env = env
-        self._note_step = note_step
+        self._note_reset, self._note_step = note_reset, note_step
         self.num_envs = env.num_envs
         self.action_dim = env.action_dim
         self.reward_term_names = env.reward_term_names
 
     def reset(self, seeds: Sequence[int]) -> Observation:
+        self._note_reset()
         return self._env.reset(seeds)
 
     def step(self, action: Float32[np.ndarray, "envs action"], next_seeds: Sequence[int]) -> StepResult:
@@ -308,7 +285,7 @@ class _WatchedEnv:
         self._env.close()
 
 
-def _require_finite(block: TransitionBlock) -> None:
-    for name in ("reward", "proprio", "goal", "action"):
-        if not np.isfinite(getattr(block, name)).all():
-            raise FloatingPointError(f"{name} of the environment is not finite in block {block.sequence}")
+def _require_finite_actions(block: TransitionBlock) -> None:
+    """The rollout leaves out what the environment breaks; actions that are not finite come from the weights."""
+    if not np.isfinite(block.action).all():
+        raise FloatingPointError(f"the policy of version {block.policy_version} acts in numbers that are not finite")

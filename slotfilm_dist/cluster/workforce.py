@@ -2,15 +2,18 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError, RunFailedError
+from slotfilm_dist.backend import RunFailedError
+from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
 from slotfilm_dist.cluster.hub_client import HubClient
-from slotfilm_dist.cluster.messages import AgentSetup, BlockKey
-from slotfilm_dist.cluster.placement import share_for_more
+from slotfilm_dist.cluster.inference_client import InferenceClient
+from slotfilm_dist.cluster.messages import AgentSetup, BlockKey, HubStatus
+from slotfilm_dist.cluster.placement import WORKER_RESOURCE, share_for_more
 from slotfilm_dist.cluster.replay_client import ReplayClient, ShardClient
 from slotfilm_dist.cluster.role_clients import WorkerClient
+from slotfilm_dist.cluster.scaling import Load, WorkerScaler
 from slotfilm_dist.cluster.session import Session
 from slotfilm_dist.cluster.system import ShardWatch, Supervisor
 from slotfilm_dist.config import RunConfig
@@ -46,6 +49,7 @@ class Workforce:
         share_cpus: cores of each worker.
         first_incarnation: higher than any of earlier starts of the run.
         snapshot_s: seconds between snapshots of replay.
+        labels: of the workers' metrics; empty for none.
     """
 
     def __init__(
@@ -58,12 +62,15 @@ class Workforce:
         share_cpus: float,
         first_incarnation: int,
         snapshot_s: float,
+        labels: Mapping[str, str],
     ) -> None:
         self._config, self._session, self._hub = config, session, hub
         self._make_env, self._limits, self._share_cpus = make_env, limits, share_cpus
-        self._snapshot_s = snapshot_s
+        self._snapshot_s, self._labels = snapshot_s, labels
         self._shards: Sequence[ShardClient] = ()
-        self._setup: AgentSetup | None = None
+        self._agent: AgentSetup | InferenceClient | None = None
+        self._scaler = WorkerScaler(max_workers=config.runtime.max_workers, worker_cpus=share_cpus)
+        self._launched: set[int] = set()
         self._failure: RunFailedError | None = None
         self._closing = threading.Event()
         self.watch: ShardWatch | None = None
@@ -75,7 +82,7 @@ class Workforce:
     @property
     def training(self) -> bool:
         """The workers collect for replay."""
-        return self._setup is not None
+        return self._agent is not None
 
     def check(self) -> None:
         """Raise `RunFailedError` if a role could not be kept alive."""
@@ -114,10 +121,31 @@ class Workforce:
                     done += block.num_steps
                     yield block
 
-    def train(self, shards: Sequence[ShardClient], watch: ShardWatch, setup: AgentSetup) -> None:
-        """Set all workers to collect for replay with the trained agent."""
-        self._shards, self.watch, self._setup = shards, watch, setup
+    def train(self, shards: Sequence[ShardClient], watch: ShardWatch, agent: AgentSetup | InferenceClient) -> None:
+        """Set all workers to collect for replay with the trained agent, in their processes or in one for all."""
+        self._shards, self.watch, self._agent = shards, watch, agent
         self.supervisor.employ_again()
+
+    def adapt(self, counts: HubStatus, learner_waited_s: float) -> None:
+        """Where the run decides by itself how many workers it has: decide, by who has waited for whom.
+
+        Args:
+            counts: of the run now.
+            learner_waited_s: time that the learner has waited for something to learn from, summed.
+        """
+        if not (counts.auto_workers and self.training):
+            return
+        load = Load(
+            at_s=time.monotonic(),
+            wanted_workers=counts.wanted_workers,
+            alive_workers=counts.alive_workers,
+            free_cpus=self._session.available_cpus(),
+            learner_waited_s=learner_waited_s,
+            workers_waited_s={beat.worker_id: beat.waited_s for beat in self.supervisor.beats()},
+        )
+        wanted = self._scaler.wanted(load)
+        if wanted != counts.wanted_workers:
+            self._hub.adapt_workers(wanted)
 
     def process_ids(self) -> dict[str, int]:
         """Of the workers' processes, by name."""
@@ -137,17 +165,21 @@ class Workforce:
         return [handle for handle in self.supervisor.handles if isinstance(handle, WorkerClient)]
 
     def _launch(self, worker_id: int) -> WorkerClient:
-        share = self._share_cpus
-        if worker_id >= self._config.runtime.num_workers:
-            share = min(share, share_for_more(1, self._session.available_cpus()))
-        return WorkerClient.launch(self._config, worker_id, self._make_env, self._limits, share)
+        """A worker that must wait for cores collects nothing: all but the first ones take what there is, down to 0."""
+        share, resources = self._share_cpus, self._session.place(WORKER_RESOURCE)
+        if worker_id >= self._config.runtime.num_workers or worker_id in self._launched:
+            share = 0.0 if resources else min(share, share_for_more(1, self._session.available_cpus()))
+        self._launched.add(worker_id)
+        return WorkerClient.launch(
+            *(self._config, worker_id, self._make_env, self._limits, share), resources=resources, labels=self._labels
+        )
 
     def _employ(self, handle: Any, incarnation: int) -> None:
-        if self._setup is None:
+        if self._agent is None:
             handle.collect_randomly(incarnation)
             return
         seed = role_seed(self._config.seed, Role.REPLAY, INSERT_STREAMS + handle.worker_id, incarnation)
-        handle.train(incarnation, self._hub, ReplayClient(self._shards, seed), self._setup)
+        handle.train(incarnation, self._hub, ReplayClient(self._shards, seed), self._agent)
 
     def _settle(self, worker_id: int, incarnation: int) -> None:
         """Take back the steps that a lost worker was granted and that no shard holds."""

@@ -1,5 +1,6 @@
 """`slotfilm scale`: more or fewer workers for a run that is under way."""
 
+import argparse
 import json
 import os
 import sys
@@ -13,6 +14,8 @@ from slotfilm_dist.commands.options import Parser
 if TYPE_CHECKING:
     from slotfilm_dist.cluster.hub_client import HubClient
 
+AUTO = 0
+"""Instead of a number of workers: as many as the learner needs."""
 MEASURE_S = 5.0
 """Time over which the steps per second are measured before and after."""
 
@@ -24,7 +27,13 @@ def main(arguments: Sequence[str]) -> int:
         description="Change the number of environment workers of a live run on Ray; the learner goes on meanwhile.",
     )
     parser.add_argument("run", help="directory of the run")
-    parser.add_argument("--workers", type=int, required=True, metavar="N", help="workers wanted, 1 or more")
+    parser.add_argument(
+        "--workers",
+        type=workers_wanted,
+        required=True,
+        metavar="N|auto",
+        help="workers wanted, 1 or more; auto adds and removes them as the learner needs them",
+    )
     parser.add_argument(
         "--timeout-s",
         type=float,
@@ -34,8 +43,6 @@ def main(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
     options = parser.parse_args(arguments)
-    if options.workers < 1:
-        raise ValueError(f"--workers {options.workers}: must be 1 or more; Ctrl-C stops a run")
     if options.timeout_s < 0:
         raise ValueError(f"--timeout-s {options.timeout_s:g}: must be 0 or more")
 
@@ -45,6 +52,9 @@ def main(arguments: Sequence[str]) -> int:
 
     with joined(Path(options.run)) as namespace:
         hub = HubClient.find(namespace)
+        if options.workers == AUTO:
+            hub.want_auto_workers()
+            return _tell_auto(hub.status().alive_workers, as_json=options.json)
         before = hub.status()
         rate_before = _steps_per_s(hub) if options.timeout_s else 0.0
         hub.want_workers(options.workers)
@@ -70,6 +80,23 @@ def main(arguments: Sequence[str]) -> int:
     else:
         print(_sentence(result, reached=reached, waited=options.timeout_s > 0))
     return 0 if reached or options.timeout_s == 0 else 1
+
+
+def workers_wanted(word: str) -> int:
+    """A number of workers, or `AUTO`; raises ``ArgumentTypeError`` for any other word."""
+    if word == "auto":
+        return AUTO
+    if not word.isdecimal() or int(word) < 1:
+        raise argparse.ArgumentTypeError(f"{word}: must be 1 or more, or auto")
+    return int(word)
+
+
+def _tell_auto(alive_workers: int, *, as_json: bool) -> int:
+    if as_json:
+        print(json.dumps({"workers_before": alive_workers, "workers_wanted": "auto"}))
+    else:
+        print(f"{alive_workers} workers; from now on as many as the learner needs, where cores are free")
+    return 0
 
 
 def _present_token(run: Path) -> None:

@@ -13,6 +13,7 @@ from slotfilm_dist.commands.options import (
     change_fields,
     parse_with_fields,
 )
+from slotfilm_dist.commands.scale import AUTO, workers_wanted
 from slotfilm_dist.config import RunConfig, load_config
 
 if TYPE_CHECKING:
@@ -23,6 +24,12 @@ def main(arguments: Sequence[str]) -> int:
     """Train; gives the exit code."""
     parser = Parser(prog="slotfilm train", description="Collect, pre-train, train, evaluate; then write a report.")
     add_config_options(parser, "quick")
+    parser.add_argument(
+        "--workers",
+        type=workers_wanted,
+        metavar="N|auto",
+        help="environment workers on Ray; auto adds and removes them as the learner needs them",
+    )
     parser.add_argument("--resume", metavar="DIR", help="go on with the run in this directory")
     parser.add_argument("--runs", default="runs", metavar="DIR", help="where run directories go (default: %(default)s)")
     parser.add_argument("--name", default="", help="name of the run directory (default: preset, variant, seed, number)")
@@ -34,6 +41,8 @@ def main(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
     options, fields = parse_with_fields(parser, arguments)
+    if options.workers is not None:
+        fields += workers_fields(options.workers)
 
     from slotfilm_dist.runs import new_run_directory
 
@@ -48,6 +57,13 @@ def main(arguments: Sequence[str]) -> int:
     return _execute(path, config, Path(options.artifacts), as_json=options.json)
 
 
+def workers_fields(workers: int) -> list[str]:
+    """What `--workers` means in the config; a number also ends an earlier `auto`."""
+    if workers == AUTO:
+        return ["--runtime.auto_workers"]
+    return ["--runtime.num_workers", str(workers), "--runtime.no_auto_workers"]
+
+
 def _resumed_config(path: Path, fields: Sequence[str]) -> RunConfig:
     from slotfilm_dist.runs import resumed_config
 
@@ -56,32 +72,13 @@ def _resumed_config(path: Path, fields: Sequence[str]) -> RunConfig:
 
 
 def _execute(path: Path, config: RunConfig, artifacts: Path, *, as_json: bool) -> int:
-    from slotfilm_dist.cluster.failures import RunFailedError
-    from slotfilm_dist.pipeline import Interrupted, Pipeline, StopFlag
-    from slotfilm_dist.progress import Progress
-    from slotfilm_dist.runs import RunDirectory
+    from slotfilm_dist.driver import drive
 
-    progress, stop = Progress(), StopFlag()
-    backend = _backend(path, config)
-    try:
-        backend.prepare()
-        with stop.listening(), RunDirectory(path, config) as run:
-            progress.say(f"slotfilm  {config.variant} on {config.env.task}, seed {config.seed}: {run.path}")
-            page = Pipeline(run, backend, artifacts, progress, stop).execute()
-    except Interrupted as interruption:
-        progress.say(f"{interruption}; go on with: slotfilm train --resume {path}")
-        return interruption.exit_code
-    except RunFailedError as failure:
-        progress.say(f"slotfilm: {failure}")
-        return 1
-    finally:
-        progress.end()
-        backend.close()
-    progress.say(f"  report  {page}")
-    if as_json:
-        json.dump({"run": str(path), "report": str(page), **_result(path)}, sys.stdout)
+    code = drive(path, config, artifacts, _backend)
+    if code == 0 and as_json:
+        json.dump({"run": str(path), "report": str(path / "report.html"), **_result(path)}, sys.stdout)
         print()
-    return 0
+    return code
 
 
 def _backend(path: Path, config: RunConfig) -> "Backend":

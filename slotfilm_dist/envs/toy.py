@@ -1,5 +1,6 @@
 """An environment without a simulator, for tests of the system around it: a point to be moved to a goal."""
 
+import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,6 +12,8 @@ from slotfilm_dist.messages import Observation, StepResult
 ACTION_DIM = 7
 STEP_LENGTH = 0.1
 """Distance that a full action moves the point."""
+SLOW_STEP_S = 0.02
+"""Time that a step of `SlowToyEnv` takes, at least."""
 REACHED = 0.1
 """Distance to the goal that counts as solved."""
 
@@ -32,8 +35,13 @@ class ToyEnv:
 
     def __init__(self, config: RunConfig, *, camera: bool, num_envs: int = 1) -> None:
         self.num_envs = num_envs
+        self.has_camera = camera
+        """Whether it gives pictures."""
+        self.episode_steps = config.env.max_steps
+        """Steps after which an episode is truncated."""
+        self.fresh_episodes = False
+        """Without a meaning here: every episode follows from its seed alone."""
         self._config = config
-        self._camera = camera
         self._point = np.zeros((num_envs, 3), np.float32)
         self._goal = np.zeros((num_envs, 3), np.float32)
         self._elapsed = np.zeros(num_envs, np.int64)
@@ -56,7 +64,7 @@ class ToyEnv:
         reward = (1 - distance / 4).astype(np.float32)
         success = distance < REACHED
         terminated = success & self._config.env.terminate_on_success
-        truncated = (self._elapsed >= self._config.env.max_steps) & ~terminated
+        truncated = (self._elapsed >= self.episode_steps) & ~terminated
         final = self._observe()
         for i in np.flatnonzero(terminated | truncated):
             self._restart(int(i), next_seeds[i])
@@ -87,14 +95,30 @@ class ToyEnv:
         uv = np.zeros((count, objects, 2), np.float32)
         goal = np.zeros((count, 3), np.float32)
         rgb = None
-        if self._camera:
+        if self.has_camera:
             size = self._config.env.image_size
-            colours = ((self._point + 1) * 127).astype(np.uint8)
+            colours = 1 + ((self._point + 1) * 127).astype(np.uint8)  # never all black, which counts as a failure
             rgb = np.broadcast_to(colours[:, None, None], (count, size, size, 3)).copy()
             uv[:] = (self._goal[:, None, :2] + 1) / 2
-        return Observation(rgb=rgb, proprio=proprio, uv=uv, visible=np.full((count, objects), self._camera), goal=goal)
+        return Observation(
+            rgb=rgb, proprio=proprio, uv=uv, visible=np.full((count, objects), self.has_camera), goal=goal
+        )
 
 
 def make_toy_env(config: RunConfig, camera: bool) -> ToyEnv:
     """The toy environment as `RayBackend` asks for one."""
     return ToyEnv(config, camera=camera)
+
+
+class SlowToyEnv(ToyEnv):
+    """A toy environment whose step takes as long as a small simulator's."""
+
+    def step(self, action: Float32[np.ndarray, "envs action"], next_seeds: Sequence[int]) -> StepResult:
+        """Wait, then move the points."""
+        time.sleep(SLOW_STEP_S)
+        return super().step(action, next_seeds)
+
+
+def make_slow_toy_env(config: RunConfig, camera: bool) -> SlowToyEnv:
+    """The slow one as `RayBackend` asks for one."""
+    return SlowToyEnv(config, camera=camera)

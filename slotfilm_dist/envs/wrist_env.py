@@ -20,6 +20,8 @@ from slotfilm_dist.envs.scene import SceneReader, SceneState
 from slotfilm_dist.envs.tasks import task_named
 from slotfilm_dist.messages import Observation, StepResult
 
+NEAR_SCALE_M = 0.02
+"""Distance over which `object_to_goal_near` tells positions apart: about the radius of the target."""
 OWN_TERMS = ("reach", "grasp", "place", "post_grasp", "static")
 
 
@@ -200,6 +202,8 @@ class WristEnv:
                 return position - tcp
             case "object_to_goal":
                 return scene.goal - position
+            case "object_to_goal_near":
+                return torch.tanh((scene.goal - position) / NEAR_SCALE_M)
             case _:
                 raise ValueError(f"obs.state_fields: {name!r} is not known to the simulator")
 

@@ -25,6 +25,8 @@ from slotfilm_dist.atomic import (
 FORMAT = 1
 """Raised when an older reader could misread what is written."""
 TENSORS, MANIFEST = "tensors.safetensors", "manifest.json"
+LARGEST_MANIFEST = 1 << 26
+"""Bytes; a real one takes a few thousand."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -77,26 +79,32 @@ def read_checkpoint(directory: Path, config_hash: str | None = None) -> Checkpoi
     path = directory / TENSORS
     try:
         digest = FileDigest(**manifest["tensors"])
-    except TypeError:
+    except (TypeError, ValueError):
         raise ValueError(f"{directory / MANIFEST}: damaged, it does not describe {TENSORS}") from None
     check_file(path, digest)
     try:
         tensors = load_tensors(path.read_bytes())
-    except safetensors.SafetensorError as error:
+    except (safetensors.SafetensorError, RuntimeError, ValueError, TypeError, KeyError, OverflowError) as error:
         raise ValueError(f"{path}: not a safetensors file ({error})") from None
     return Checkpoint(tensors=tensors, values=manifest["values"], config_hash=manifest["config_hash"])
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:
     try:
+        if path.stat().st_size > LARGEST_MANIFEST:
+            raise ValueError("it is too large")
         manifest = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ValueError(f"{path} does not exist: {path.parent} is no checkpoint") from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: damaged ({error})") from None
     if not isinstance(manifest, dict) or not manifest.keys() >= {"format", "config_hash", "tensors", "values"}:
         raise ValueError(f"{path}: damaged, fields are missing")
-    if manifest.pop("sha256", None) not in (None, _signature(manifest)):
+    if not isinstance(manifest["values"], dict) or not isinstance(manifest["config_hash"], str):
+        raise ValueError(f"{path}: damaged, fields have another type")
+    if (stated := manifest.pop("sha256", None)) is None:
+        raise ValueError(f"{path}: damaged, it does not state its own SHA-256")
+    if stated != _signature(manifest):
         raise ValueError(f"{path}: damaged, its SHA-256 differs from the one it states")
     if manifest["format"] != FORMAT:
         raise ValueError(f"{path}: written in format {manifest['format']}, this version reads {FORMAT}")
@@ -130,8 +138,12 @@ class CheckpointStore:
         """Replace `best`; gives its size in bytes."""
         return write_checkpoint(self.folder / "best", checkpoint)
 
-    def read_last(self, config_hash: str) -> tuple[Checkpoint, list[str]] | None:
+    def read_last(self, config_hash: str, *, strict: bool = False) -> tuple[Checkpoint, list[str]] | None:
         """The newest readable checkpoint and what was wrong with newer ones; None if there is none at all.
+
+        Args:
+            config_hash: hash of the config that will use it.
+            strict: refuse to go back to an older one.
 
         Raises:
             ValueError: checkpoints are there, but none can be used.
@@ -142,6 +154,8 @@ class CheckpointStore:
                 return read_checkpoint(directory, config_hash), problems
             except ValueError as error:
                 problems.append(str(error))
+                if strict:
+                    raise ValueError(f"{error}; --checkpoint.no_strict goes back to an older one") from None
         if problems:
             raise ValueError("no checkpoint can be used: " + "; ".join(problems))
         return None

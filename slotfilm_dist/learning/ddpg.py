@@ -44,6 +44,8 @@ from slotfilm_dist.nets.agent import build_actor
 from slotfilm_dist.nets.deterministic_heads import DeterministicActor, TrunkTwinCritic
 from slotfilm_dist.nets.pixel_encoder import PixelEncoder
 
+ADVICE = "lower ddpg.lr or sac.reward_scale"
+
 
 class DdpgLearner(OffPolicyLearner[DeterministicActor]):
     """Holds encoder, actor, critics and target critics and improves them batch by batch.
@@ -104,7 +106,7 @@ class DdpgLearner(OffPolicyLearner[DeterministicActor]):
         """One gradient step of critics and encoder, then of the actor, then of the target critics.
 
         Raises:
-            TrainingDivergedError: the loss was not finite `MAX_SKIPPED` times in a row.
+            TrainingDivergedError: loss or gradient was not finite `MAX_SKIPPED` times in a row.
         """
         ddpg, sac = self.config.ddpg, self.config.sac
         self.actor.noise_std.fill_(self.noise_std)
@@ -122,17 +124,17 @@ class DdpgLearner(OffPolicyLearner[DeterministicActor]):
         q = self.critic(latent, action)
         # Squared errors, not half of them as in SAC.
         critic_loss = 2 * losses.critic_loss(q, target)
-        if not self._finite(critic_loss, "lower ddpg.lr or sac.reward_scale"):
+        if not self._descend(self._critic_optimiser, critic_loss, sac.grad_clip, ADVICE):
             return
-        self._step(self._critic_optimiser, critic_loss)
 
         seen = latent.detach()
         actor_loss = (
             -self.critic(seen, self.actor(seen, self._draw(action), ddpg.noise_clip), frozen=True).amin(0).mean()
         )
-        self._step(self._actor_optimiser, actor_loss)
+        if not self._descend(self._actor_optimiser, actor_loss, 0.0, ADVICE):
+            return
         losses.polyak(self._targets, self._online, ddpg.tau)
-        self.updates += 1
+        self._count_update()
         if self.updates % METRICS_EVERY == 0:
             self._metrics = {
                 "learner_critic_loss": critic_loss.detach(),
@@ -166,11 +168,3 @@ class DdpgLearner(OffPolicyLearner[DeterministicActor]):
 
     def _draw(self, action: Float[Tensor, "batch action"]) -> Float[Tensor, "batch action"]:
         return torch.randn(action.shape, generator=self._noise, device=self.device)
-
-    def _step(self, optimiser: torch.optim.Optimizer, loss: Float[Tensor, ""]) -> None:
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        clip = self.config.sac.grad_clip
-        if clip and optimiser is self._critic_optimiser:
-            torch.nn.utils.clip_grad_norm_([p for group in optimiser.param_groups for p in group["params"]], clip)
-        optimiser.step()

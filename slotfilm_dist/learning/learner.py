@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from slotfilm_dist.config import RunConfig, config_hash
+from slotfilm_dist.config import TEMPERATURE_FIELDS, RunConfig, SacConfig, config_hash
 from slotfilm_dist.learning.checkpoint import Checkpoint, plain_tensors
 from slotfilm_dist.learning.ddpg import DdpgLearner
 from slotfilm_dist.learning.frames import PretrainFrames
@@ -237,7 +237,7 @@ class Learner:
 def learning_hash(config: RunConfig) -> str:
     """Names what a checkpoint depends on: all but budgets, places, rates and temperature, which a resume may change."""
     own = (config.ddpg,) if config.algorithm == "ddpg" else ()
-    sac = dataclasses.replace(config.sac, temperature=1.0, temperature_mode="fixed")
+    sac = dataclasses.replace(config.sac, **{name: getattr(SacConfig(), name) for name in TEMPERATURE_FIELDS})
     return config_hash(config.variant, config.seed, config.env, config.obs, config.encoder, sac, *own)
 
 

@@ -19,14 +19,14 @@ from slotfilm_dist.nets.policy_heads import Actor
 METRICS_EVERY = 10
 """Updates between measurements of the metrics; reading them every time would cost a tenth of an update."""
 MAX_SKIPPED = 10
-"""Non-finite updates in a row after which the learner stops."""
+"""Updates skipped in a row, for a loss or gradient that is not finite, after which training has diverged."""
 
 
 ActorT = TypeVar("ActorT", Actor, DeterministicActor)
 
 
 class TrainingDivergedError(RuntimeError):
-    """Losses were not finite for `MAX_SKIPPED` updates in a row."""
+    """Losses or gradients were not finite for `MAX_SKIPPED` updates in a row."""
 
 
 class OffPolicyLearner(abc.ABC, Generic[ActorT]):
@@ -54,7 +54,7 @@ class OffPolicyLearner(abc.ABC, Generic[ActorT]):
         """One gradient step of every network.
 
         Raises:
-            TrainingDivergedError: the loss was not finite `MAX_SKIPPED` times in a row.
+            TrainingDivergedError: loss or gradient was not finite `MAX_SKIPPED` times in a row.
         """
 
     @abc.abstractmethod
@@ -108,26 +108,59 @@ class OffPolicyLearner(abc.ABC, Generic[ActorT]):
         for name in (*loose, "noise_state"):
             if name not in tensors:
                 raise ValueError(f"checkpoint: {name} is missing")
+        for name, own in loose.items():
+            _check_shape(name, tensors[name], own)
+        for name in ("updates", "skipped_updates"):
+            if type(state.get(name)) is not int or state[name] < 0:
+                raise ValueError(f"checkpoint: {name} is {state.get(name)!r}, must be a whole number, 0 or more")
         with torch.no_grad():
             for name, own in loose.items():
                 own.copy_(tensors[name])
-        self._noise.set_state(tensors["noise_state"])
-        self.updates = int(state["updates"])
-        self.skipped_updates = int(state["skipped_updates"])
+        try:
+            self._noise.set_state(tensors["noise_state"])
+        except (RuntimeError, TypeError) as error:
+            raise ValueError(f"checkpoint: noise_state is no state of a random stream ({error})") from None
+        self.updates = state["updates"]
+        self.skipped_updates = state["skipped_updates"]
 
-    def _finite(self, loss: Float[Tensor, ""], advice: str) -> bool:
-        """Whether the critics' loss is finite, so that a step can be taken; counts those that are not."""
-        if torch.isfinite(loss):
-            self._skipped_in_a_row = 0
+    def scale_rates(self, factor: float) -> None:
+        """Multiply every optimiser's rate."""
+        for optimiser in self._optimisers().values():
+            for group in optimiser.param_groups:
+                group["lr"] *= factor
+
+    def _descend(self, optimiser: torch.optim.Optimizer, loss: Float[Tensor, ""], clip: float, advice: str) -> bool:
+        """Take a gradient step; False, with no parameter changed, where loss or gradient is not finite.
+
+        Args:
+            optimiser: of the parameters to change.
+            loss: what to lower.
+            clip: largest norm of the gradient; 0 leaves it as it is.
+            advice: against losses that stay so.
+
+        Raises:
+            TrainingDivergedError: that happened `MAX_SKIPPED` times in a row.
+        """
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        parameters = [p for group in optimiser.param_groups for p in group["params"]]
+        norm = torch.nn.utils.clip_grad_norm_(parameters, clip) if clip else gradient_norm(parameters)
+        if torch.isfinite(loss.detach() + norm):
+            optimiser.step()
             return True
         self.skipped_updates += 1
         self._skipped_in_a_row += 1
         if self._skipped_in_a_row >= MAX_SKIPPED:
+            self._skipped_in_a_row = 0
             raise TrainingDivergedError(
-                f"the critic's loss was not finite {MAX_SKIPPED} times in a row at update {self.updates}; "
-                f"{advice}, or go back to a checkpoint"
+                f"loss or gradient was not finite {MAX_SKIPPED} times in a row at update {self.updates}; {advice}"
             )
         return False
+
+    def _count_update(self) -> None:
+        """Note that every network has taken its step."""
+        self.updates += 1
+        self._skipped_in_a_row = 0
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         with warnings.catch_warnings():
@@ -153,20 +186,25 @@ def _load_module(module: torch.nn.Module, name: str, tensors: Mapping[str, Tenso
             raise ValueError(
                 f"checkpoint: {prefix}{key} is {'missing' if key not in saved else 'not part of this agent'}"
             )
-        if saved[key].shape != expected[key].shape:
-            raise ValueError(
-                f"checkpoint: {prefix}{key} has shape {tuple(saved[key].shape)}, "
-                f"this agent needs {tuple(expected[key].shape)}"
-            )
+        _check_shape(prefix + key, saved[key], expected[key])
     module.load_state_dict(saved)
 
 
+def _check_shape(name: str, saved: Tensor, own: Tensor) -> None:
+    if saved.shape != own.shape:
+        raise ValueError(f"checkpoint: {name} has shape {tuple(saved.shape)}, this agent needs {tuple(own.shape)}")
+
+
 def _load_optimiser(optimiser: torch.optim.Optimizer, name: str, tensors: Mapping[str, Tensor]) -> None:
+    parameters = [p for group in optimiser.param_groups for p in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
     for key, value in tensors.items():
         owner, _, rest = key.partition(".")
         if owner == name:
             index, _, field = rest.partition(".")
+            if not (index.isdecimal() and index.isascii() and len(index) < 9 and int(index) < len(parameters)):
+                raise ValueError(f"checkpoint: {key} is not part of this agent")
+            _check_shape(key, value, value.new_empty(()) if field == "step" else parameters[int(index)])
             state.setdefault(int(index), {})[field] = value
     fields = {field for moments in state.values() for field in moments}
     for index, moments in state.items():

@@ -1,7 +1,8 @@
 """Soft Actor-Critic on an encoder: one `update` is one line of Algorithm 1's loop.
 
 With `sac.augment_views = 2` it is the study's DrQ-v1 (Kostrikov et al. 2020, Algorithm 1 with K = M = 2) on the paper's
-SAC with a value network; "all SAC-based methods share identical SAC hyperparameters" (Section 5.1). Point by point:
+SAC with a value network; "all SAC-based methods share identical SAC hyperparameters" (Section 5.1). Point by point,
+read against the publication's released code:
 
 published                                           here
 target: soft value of the target critics, averaged  target value network, averaged over K shifts of s'; the value
@@ -16,7 +17,7 @@ Departures:
   target network of this SAC reads a latent.
 - Actor, critics and value network share one latent, see `nets.pixel_encoder`.
 - Table A1 and `sac` give all numbers, not the publication: batch 512, 1024 x 1024 layers, every rate 1e-3, temperature
-  tuned from 0.1, Polyak rate 0.01, actor and targets every 2nd update.
+  tuned from 0.1, Polyak rate 0.01, actor and targets every 2nd update, log standard deviation squashed to [-10, 2].
 """
 
 import math
@@ -28,13 +29,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config import RunConfig, SacConfig
 from slotfilm_dist.learning import losses
 from slotfilm_dist.learning.augment import random_shift
+from slotfilm_dist.learning.lean_adam import LeanAdam
 from slotfilm_dist.learning.off_policy import METRICS_EVERY, OffPolicyLearner, gradient_norm
 from slotfilm_dist.messages import SampleBatch
 from slotfilm_dist.nets.agent import AgentEncoder
 from slotfilm_dist.nets.policy_heads import Actor, TwinCritic, ValueNet
+
+ADVICE = "lower lr.critic_value or lr.fusion, set sac.critic_norm = layer"
 
 
 class SacLearner(OffPolicyLearner[Actor]):
@@ -81,13 +85,12 @@ class SacLearner(OffPolicyLearner[Actor]):
         groups.append({"params": self.encoder.gate_parameters(), "lr": lr.goal_gate})
         if self.config.sac.end_to_end:
             groups.append({"params": self.encoder.backbone_parameters(), "lr": lr.backbone})
-        self._critic_optimiser = torch.optim.Adam([g for g in groups if g["params"]], fused=True)
-        self._policy_optimiser = torch.optim.Adam(
+        self._critic_optimiser = LeanAdam([g for g in groups if g["params"]])
+        self._policy_optimiser = LeanAdam(
             [
                 {"params": list(self.value.parameters()), "lr": lr.critic_value},
                 {"params": list(self.actor.parameters()), "lr": lr.actor},
-            ],
-            fused=True,
+            ]
         )
         self._temperature_optimiser = torch.optim.Adam([self.log_temperature], lr=lr.temperature)
         self._targets = [p.data for p in self.target_value.parameters()]
@@ -97,7 +100,7 @@ class SacLearner(OffPolicyLearner[Actor]):
         """One gradient step of critics and encoder, value network, actor and target (Algorithm 1, lines 3-11).
 
         Raises:
-            TrainingDivergedError: the loss was not finite `MAX_SKIPPED` times in a row.
+            TrainingDivergedError: loss or gradient was not finite `MAX_SKIPPED` times in a row.
         """
         sac = self.config.sac
         action, terminated, truncated = (self._tensor(x) for x in (batch.action, batch.terminated, batch.truncated))
@@ -111,7 +114,7 @@ class SacLearner(OffPolicyLearner[Actor]):
         views = max(1, sac.augment_views)
         q = self.critic(latent, action.repeat(views, 1))
         critic_loss = losses.critic_loss(q, target.repeat(views))
-        if not self._step_critic(critic_loss):
+        if not self._descend(self._critic_optimiser, critic_loss, sac.grad_clip, ADVICE):
             return
 
         seen = latent[: len(action)].detach()
@@ -122,58 +125,43 @@ class SacLearner(OffPolicyLearner[Actor]):
         value = self.value(seen)
         value_loss = losses.value_loss(value, min_q.detach(), sample.log_prob.detach(), temperature)
         actor_loss = losses.actor_loss(min_q, sample.log_prob, temperature)
-        self._policy_optimiser.zero_grad(set_to_none=True)
-        (value_loss + actor_loss).backward()
-        self._policy_optimiser.step()
+        if not self._descend(self._policy_optimiser, value_loss + actor_loss, 0.0, ADVICE):
+            return
         if sac.temperature_mode == "auto":
             self._step_temperature(sample.log_prob.detach())
+        elif sac.temperature_mode == "annealed":
+            self._set_temperature(annealed_temperature(sac, self.updates + 1))
         losses.polyak(self._targets, self._online, sac.tau)
-        self.updates += 1
+        self._count_update()
         if self.updates % METRICS_EVERY == 0:
-            self._measure(critic_loss, value_loss, actor_loss, q, target, sample.log_prob, temperature)
-
-    def _step_critic(self, loss: Float[Tensor, ""]) -> bool:
-        """Whether the loss was finite and the step taken."""
-        if not self._finite(loss, "lower lr.critic_value or lr.fusion, set sac.critic_norm = layer"):
-            return False
-        self._critic_optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        clip = self.config.sac.grad_clip
-        if clip:
-            parameters = [p for group in self._critic_optimiser.param_groups for p in group["params"]]
-            torch.nn.utils.clip_grad_norm_(parameters, clip)
-        self._critic_optimiser.step()
-        return True
+            self._metrics = self._gradient_norms() | self.encoder.diagnostics(self._tensor(batch.proprio))
+            self._metrics |= {
+                "learner_critic_loss": critic_loss.detach(),
+                "learner_value_loss": value_loss.detach(),
+                "learner_actor_loss": actor_loss.detach(),
+                "learner_q_mean": q.detach().mean(),
+                "learner_q_max": q.detach().max(),
+                "learner_value_mean": value.detach().mean(),
+                "learner_target_mean": target.mean(),
+                "learner_reward_mean": reward.mean(),
+                "learner_entropy_nats": -sample.log_prob.detach().mean(),
+                "learner_temperature": temperature,
+            }
 
     def _step_temperature(self, log_prob: Float[Tensor, " batch"]) -> None:
         self._temperature_optimiser.zero_grad(set_to_none=True)
         losses.temperature_loss(self.log_temperature, log_prob, self.config.sac.target_entropy).backward()
         self._temperature_optimiser.step()
 
-    def _measure(
-        self,
-        critic_loss: Float[Tensor, ""],
-        value_loss: Float[Tensor, ""],
-        actor_loss: Float[Tensor, ""],
-        q: Float[Tensor, "2 seen"],
-        target: Float[Tensor, " batch"],
-        log_prob: Float[Tensor, " batch"],
-        temperature: Float[Tensor, ""],
-    ) -> None:
+    def _gradient_norms(self) -> dict[str, Tensor]:
+        """Of the step just taken, before clipping."""
         norms = {
             "learner_critic_gradient_norm": self.critic.parameters(),
             "learner_encoder_gradient_norm": self.encoder.fusion_parameters(),
+            "learner_value_gradient_norm": self.value.parameters(),
             "learner_actor_gradient_norm": self.actor.parameters(),
         }
-        self._metrics = {
-            "learner_critic_loss": critic_loss.detach(),
-            "learner_value_loss": value_loss.detach(),
-            "learner_actor_loss": actor_loss.detach(),
-            "learner_q_mean": q.detach().mean(),
-            "learner_target_mean": target.mean(),
-            "learner_entropy_nats": -log_prob.detach().mean(),
-            "learner_temperature": temperature,
-        } | {name: gradient_norm(parameters) for name, parameters in norms.items()}
+        return {name: gradient_norm(parameters) for name, parameters in norms.items()}
 
     def _encode(self, visual: np.ndarray, proprio: np.ndarray, goal: np.ndarray) -> Float[Tensor, "seen latent"]:
         """Latents; with `sac.augment_views`, those of every sample's first shifted view, then of all second ones."""
@@ -205,9 +193,20 @@ class SacLearner(OffPolicyLearner[Actor]):
     def load(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state; a fixed temperature is the config's, which may have changed on resuming."""
         super().load(state)
-        if self.config.sac.temperature_mode == "fixed":
-            with torch.no_grad():
-                self.log_temperature.fill_(math.log(self.config.sac.temperature))
+        if self.config.sac.temperature_mode != "auto":
+            self._set_temperature(annealed_temperature(self.config.sac, self.updates))
+
+    def _set_temperature(self, temperature: float) -> None:
+        with torch.no_grad():
+            self.log_temperature.fill_(math.log(temperature))
 
     def _loose_tensors(self) -> dict[str, Tensor]:
         return {"log_temperature": self.log_temperature}
+
+
+def annealed_temperature(sac: SacConfig, updates: int) -> float:
+    """The temperature after so many updates, when it is not tuned: constant, or falling geometrically."""
+    if sac.temperature_mode != "annealed":
+        return sac.temperature
+    done = min(1.0, updates / sac.annealing_updates)
+    return sac.temperature ** (1.0 - done) * sac.final_temperature**done

@@ -143,6 +143,17 @@ class SlotFusionEncoder(HandedOver):
         """UV and visibility heads."""
         return [] if self.perception is None else self.perception.head_parameters()
 
+    @torch.no_grad()
+    def diagnostics(self, proprio: Float[Tensor, "batch proprio"]) -> dict[str, Float[Tensor, ""]]:
+        """How strongly the state modulates the latent, and the goal's share in it, for states in their own units."""
+        found: dict[str, Tensor] = {}
+        if self.fusion is not None and self.fusion.has_film:
+            gain, shift = self.fusion.modulation(self.standardise(proprio))
+            found |= {"learner_film_gain": gain.abs().mean(), "learner_film_shift": shift.abs().mean()}
+        if self.gate_logits is not None:
+            found["learner_goal_gate"] = self.gate_logits.softmax(0)[1]
+        return found
+
     def backbone_hash(self) -> str:
         """Hash of everything that determines the tokens: backbone, its BatchNorm statistics and the projection."""
         state = self.state_dict()

@@ -43,10 +43,21 @@ class StateFusion(nn.Module):
             case "concat_proj":
                 return self.concat_projection(torch.cat((pooled, state), dim=1))
             case _:
-                gamma, beta = self.film(self.state_projection(state)).chunk(2, dim=1)
-                bounded = gamma.tanh() if self.fusion == "film_tanh" else gamma.clamp(-1.0, 1.0)
-                return torch.addcmul(pooled + beta, bounded, pooled)
+                gain, shift = self.modulation(state)
+                return torch.addcmul(pooled + shift, gain, pooled)
+
+    @property
+    def has_film(self) -> bool:
+        """Whether the state modulates the latent."""
+        return hasattr(self, "film")
+
+    def modulation(
+        self, state: Float[Tensor, "batch proprio"]
+    ) -> tuple[Float[Tensor, "batch dim"], Float[Tensor, "batch dim"]]:
+        """Bounded gamma, and beta, of the FiLM forms (Section 4.2 and its clamped ablation, Section 7.1)."""
+        gamma, beta = self.film(self.state_projection(state)).chunk(2, dim=1)
+        return (gamma.tanh() if self.fusion == "film_tanh" else gamma.clamp(-1.0, 1.0)), beta
 
     def is_identity(self) -> bool:
         """Whether the state changes nothing yet: every FiLM weight is zero, or there is no FiLM."""
-        return not hasattr(self, "film") or not any(bool(p.any()) for p in self.film.parameters())
+        return not self.has_film or not any(bool(p.any()) for p in self.film.parameters())

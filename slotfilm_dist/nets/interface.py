@@ -62,6 +62,10 @@ class Encoder(Protocol):
         """Heads that only pre-training's losses reach."""
         ...
 
+    def diagnostics(self, proprio: Float[Tensor, "batch proprio"]) -> dict[str, Float[Tensor, ""]]:
+        """What is worth watching inside it, by the metrics' names."""
+        ...
+
     def backbone_hash(self) -> str:
         """Names the weights that made the tokens; empty where there are none."""
         ...

@@ -131,6 +131,10 @@ class PixelEncoder(HandedOver):
         """None: there is no pre-training."""
         return []
 
+    def diagnostics(self, proprio: Float[Tensor, "batch proprio"]) -> dict[str, Float[Tensor, ""]]:
+        """None: there is no modulation."""
+        return {}
+
     def backbone_hash(self) -> str:
         """Empty: replay holds pictures, which belong to no weights."""
         return ""

@@ -23,7 +23,8 @@ RANDOM_STEPS = 200
 
 @pytest.fixture(scope="session")
 def session() -> Iterator[Session]:
-    cluster = Session(num_cpus=2)
+    # More than there may be: room for workers beyond the first ones; on few cores everything is only slower.
+    cluster = Session(num_cpus=8)
     yield cluster
     cluster.close()
 
@@ -48,7 +49,7 @@ def make_dataset(tmp_path_factory: pytest.TempPathFactory) -> Callable[[RunConfi
     def make(config: RunConfig) -> Path:
         name = dataset_hash(config)
         if name not in made:
-            env = ToyEnv(config, camera=False)
+            env = ToyEnv(config, camera=config.encoder.uses_image)
             policy = RandomPolicy(env.action_dim, np.random.SeedSequence(0))
             loop = RolloutLoop(env, policy, np.random.SeedSequence(1))
             made[name] = tmp_path_factory.mktemp("data") / name
@@ -68,7 +69,7 @@ def start(session: Session) -> Iterator[Callable[..., RayBackend]]:
 
     def make(config: RunConfig, run: Path, **options: object) -> RayBackend:
         run.mkdir(parents=True, exist_ok=True)
-        started.append(RayBackend(config, run, make_toy_env, **options))
+        started.append(RayBackend(config, run, **({"make_env": make_toy_env} | options)))
         started[-1].prepare()
         return started[-1]
 

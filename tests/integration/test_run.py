@@ -12,9 +12,10 @@ import pytest
 from slotfilm_dist.cluster.backend import RayBackend
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.metrics import check_names
-from slotfilm_dist.pipeline import Pipeline, StopFlag
+from slotfilm_dist.pipeline import Pipeline
 from slotfilm_dist.progress import Progress
 from slotfilm_dist.runs import RunDirectory
+from slotfilm_dist.stopping import StopFlag
 
 Start = Callable[..., RayBackend]
 MakeDataset = Callable[[RunConfig], Path]

@@ -22,10 +22,11 @@ import yaml
 from slotfilm_dist.cluster.backend import RayBackend
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.envs.toy import make_toy_env
-from slotfilm_dist.pipeline import Pipeline, StopFlag
+from slotfilm_dist.pipeline import Pipeline
 from slotfilm_dist.presets import smoke
 from slotfilm_dist.progress import Progress
 from slotfilm_dist.runs import RunDirectory
+from slotfilm_dist.stopping import StopFlag
 from slotfilm_dist.variants import apply_variant
 
 OPS = Path(__file__).parents[2] / "ops"

@@ -14,10 +14,11 @@ from slotfilm_dist.envs.tasks import adapt_config
 from slotfilm_dist.learning.checkpoint import CheckpointStore
 from slotfilm_dist.learning.learner import learning_hash
 from slotfilm_dist.local import LocalBackend
-from slotfilm_dist.pipeline import Interrupted, Pipeline, StopFlag
+from slotfilm_dist.pipeline import Pipeline
 from slotfilm_dist.presets import smoke
 from slotfilm_dist.progress import Progress
 from slotfilm_dist.runs import RunDirectory
+from slotfilm_dist.stopping import Interrupted, StopFlag
 from slotfilm_dist.variants import apply_variant
 
 pytestmark = pytest.mark.sim

@@ -97,7 +97,7 @@ def test_unknown_key_and_wrong_type_are_refused_in_one_sentence(path: str, value
 
 
 def test_state_dim_is_checked_against_the_fields() -> None:
-    with pytest.raises(ValueError, match="add up to 18; set obs.state_dim = 18"):
+    with pytest.raises(ValueError, match=r"add up to 18; set obs\.state_dim = 18"):
         ObsConfig(state_fields=("qpos", "qvel"))
     with pytest.raises(ValueError, match=r"obs\.state_dim"):
         ObsConfig(state_fields=(), state_dim=0)
@@ -133,7 +133,7 @@ def test_corrupt_file_is_refused_by_its_name(tmp_path: Path, content: str) -> No
 
 def test_bytes_that_are_no_text_and_a_missing_file_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "config.json"
-    with pytest.raises(ValueError, match="does not exist; a run directory has a config.json"):
+    with pytest.raises(ValueError, match=r"does not exist; a run directory has a config\.json"):
         load_config(path)
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ValueError, match="not valid JSON"):

@@ -5,6 +5,7 @@ import pytest
 from slotfilm_dist.metrics import AXES, METRICS, PHASES, check_names, find_metric, phase_index
 
 ROLES = {
+    "inference",
     *("run", "worker", "replay", "limiter", "weights", "learner"),
     *("episode", "eval", "pretrain", "checkpoint", "sink"),
 }
@@ -74,7 +75,7 @@ def test_wrong_label_is_refused(key, problem):
 
 
 def test_exported_name_has_the_prefix():
-    assert METRICS["limiter_ratio"].exported_name == "slotfilm_limiter_ratio"
+    assert METRICS["limiter_ratio"].exported_name == "ray_slotfilm_limiter_ratio"
 
 
 def test_phase_index_round_trips_and_refuses_other_words():

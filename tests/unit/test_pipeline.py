@@ -14,10 +14,11 @@ from rich.console import Console
 from slotfilm_dist.backend import Player, TrainReport
 from slotfilm_dist.config import RunConfig, load_config
 from slotfilm_dist.messages import EpisodeSummary, TransitionBlock
-from slotfilm_dist.pipeline import Interrupted, Pipeline, StopFlag
+from slotfilm_dist.pipeline import Pipeline
 from slotfilm_dist.presets import smoke
 from slotfilm_dist.progress import Progress
 from slotfilm_dist.runs import RunDirectory
+from slotfilm_dist.stopping import Interrupted, StopFlag
 from slotfilm_dist.variants import apply_variant
 
 

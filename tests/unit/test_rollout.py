@@ -1,6 +1,7 @@
 """Rollouts in an environment whose numbers say which episode and step they belong to."""
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Container, Sequence
 
 import numpy as np
 import pytest
@@ -8,13 +9,14 @@ import pytest
 from slotfilm_dist.evaluation.rollouts import play_episodes
 from slotfilm_dist.messages import Observation, StepResult, TransitionBlock
 from slotfilm_dist.policy import RandomPolicy
+from slotfilm_dist.rejection import MAX_REJECTED, BrokenEnvironmentError
 from slotfilm_dist.rollout import TRAINING_SEEDS, RolloutLoop
 
 LENGTH = 5
 
 
 class CountingEnv:
-    """Episodes of `LENGTH` steps: the state is (seed, step), every pixel the step, the reward 10 x step."""
+    """Episodes of `LENGTH` steps: the state is (seed, step), every pixel the step + 1, the reward 10 x step."""
 
     action_dim = 2
     reward_term_names: tuple[str, ...] = ("count",)
@@ -60,7 +62,7 @@ class CountingEnv:
         count = self.num_envs
         proprio = np.stack((np.array(self._seeds), self._step), axis=1).astype(np.float32)
         return Observation(
-            rgb=np.broadcast_to(self._step[:, None, None, None], (count, 4, 4, 3)).astype(np.uint8),
+            rgb=np.broadcast_to(self._step[:, None, None, None] + 1, (count, 4, 4, 3)).astype(np.uint8),
             proprio=proprio,
             uv=np.full((count, 1, 2), 0.5, np.float32),
             visible=np.ones((count, 1), bool),
@@ -82,7 +84,7 @@ def test_next_frame_of_the_last_step_is_the_true_final_one_and_not_the_reset_one
     block = loop_in(env).collect(100)
     assert block.num_steps == LENGTH
     assert block.proprio[:, 1].tolist() == [0, 1, 2, 3, 4, 5]
-    assert block.visual[:, 0, 0, 0].tolist() == [0, 1, 2, 3, 4, 5]
+    assert block.visual[:, 0, 0, 0].tolist() == [1, 2, 3, 4, 5, 6]
     assert set(block.proprio[:, 0]) == {np.float32(env.started[0])}
     assert block.is_step.tolist() == [True] * 5 + [False]
     ended = block.terminated if terminates else block.truncated
@@ -168,3 +170,59 @@ def test_evaluation_plays_each_seed_once_to_its_end_without_a_block() -> None:
     episodes = list(play_episodes(env, policy, [7, 8, 9]))
     assert [(e.seed, e.length) for e in episodes] == [(7, LENGTH), (8, LENGTH), (9, LENGTH)]
     assert len(env.executed) == 3 * LENGTH
+
+
+class BreakingEnv(CountingEnv):
+    """Breaks one thing in the first environment at some calls of `step`, numbered from 0."""
+
+    def __init__(self, what: str, when: Container[int], num_envs: int = 1) -> None:
+        super().__init__(num_envs)
+        self._what, self._when = what, when
+
+    def step(self, action: np.ndarray, next_seeds: Sequence[int]) -> StepResult:
+        result = super().step(action, next_seeds)
+        if len(self.executed) - 1 not in self._when:
+            return result
+        if self._what == "reward":
+            return dataclasses.replace(result, reward=np.where(np.arange(self.num_envs) == 0, np.nan, result.reward))
+        spoilt = result.final.proprio.copy(), result.final.rgb.copy()
+        spoilt[0][0, 1] = np.inf if self._what == "state" else spoilt[0][0, 1]
+        spoilt[1][0] *= self._what != "picture"
+        return dataclasses.replace(result, final=dataclasses.replace(result.final, proprio=spoilt[0], rgb=spoilt[1]))
+
+
+@pytest.mark.parametrize("what", ["reward", "state", "picture"])
+def test_broken_step_is_left_out_and_its_episode_ends_without_a_summary(what: str) -> None:
+    env = BreakingEnv(what, {2})
+    loop = loop_in(env)
+    first, second = loop.collect(100), loop.collect(100)
+    assert first.proprio[:, 1].tolist() == [0, 1, 2]
+    assert first.is_step.tolist() == [True, True, False]
+    assert not first.truncated.any()
+    assert not first.terminated.any()
+    assert first.episodes == ()
+    assert second.proprio[:, 1].tolist() == [0, 1, 2, 3, 4, 5]
+    assert (loop.num_rejected, loop.num_cut_episodes) == (1, 1)
+
+
+def test_block_whose_first_step_is_broken_is_not_empty() -> None:
+    block = loop_in(BreakingEnv("reward", {0})).collect(1)
+    assert block.proprio[:, 1].tolist() == [0, 1]
+
+
+def test_other_environments_keep_their_steps_when_one_breaks() -> None:
+    loop = loop_in(BreakingEnv("reward", {1}, num_envs=3))
+    block = loop.collect(4)
+    assert np.isfinite(block.reward).all()
+    steps = np.flatnonzero(block.is_step)
+    assert len(steps) == 3 * 4 - 1
+    assert (block.proprio[next_rows(block), 0] == block.proprio[steps, 0]).all()
+    assert (block.proprio[next_rows(block), 1] == block.proprio[steps, 1] + 1).all()
+    assert loop.num_cut_episodes == 3
+
+
+def test_environment_that_breaks_too_often_is_given_up() -> None:
+    loop = loop_in(BreakingEnv("reward", range(1000)))
+    with pytest.raises(BrokenEnvironmentError, match=f"{MAX_REJECTED + 1} of the environment's last"):
+        loop.collect(100)
+    assert loop.num_rejected == MAX_REJECTED + 1

@@ -1,6 +1,8 @@
 """Run directories: names, the lock, what may change on resuming."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -94,3 +96,19 @@ def test_episodes_are_appended_as_lines(tmp_path: Path) -> None:
     assert [line["env_steps"] for line in lines] == [400, 800, 800]
     assert lines[0]["seed"] == 5
     assert lines[2]["policy_version"] == 4
+
+
+def test_room_of_a_run_counts_the_processes_that_it_started(tmp_path: Path) -> None:
+    with RunDirectory(new_run_directory(tmp_path, CONFIG, "smoke"), CONFIG) as run:
+        check_room(run)
+
+
+def check_room(run: RunDirectory) -> None:
+    alone = run.room()["run_memory_bytes"]
+    code = "import sys; held = bytearray(b'x') * 64_000_000; print(flush=True); sys.stdin.read()"
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        child.stdout.readline()
+        with_child = run.room()["run_memory_bytes"]
+        child.communicate()
+    assert with_child - alone > 64_000_000

@@ -138,11 +138,11 @@ def test_prometheus_serves_gauges_counters_and_labels():
         text = scrape(sink)
     finally:
         sink.close()
-    assert 'slotfilm_limiter_ratio{run="a"} 1.0' in text
-    assert 'slotfilm_worker_restarts_total{reason="crash",run="a"} 1.0' in text
-    assert 'slotfilm_worker_restarts_total{reason="hang",run="a"} 2.0' in text
-    assert "# TYPE slotfilm_worker_restarts_total counter" in text
-    assert "# TYPE slotfilm_limiter_ratio gauge" in text
+    assert 'ray_slotfilm_limiter_ratio{role="limiter",run="a",worker=""} 1.0' in text
+    assert 'ray_slotfilm_worker_restarts_total{reason="crash",role="worker",run="a",worker=""} 1.0' in text
+    assert 'ray_slotfilm_worker_restarts_total{reason="hang",role="worker",run="a",worker=""} 2.0' in text
+    assert "# TYPE ray_slotfilm_worker_restarts_total counter" in text
+    assert "# TYPE ray_slotfilm_limiter_ratio gauge" in text
 
 
 def test_prometheus_histogram_counts_every_observation_once():
@@ -154,9 +154,11 @@ def test_prometheus_histogram_counts_every_observation_once():
     finally:
         sink.close()
     for bound, count in (("0.001", 0), ("0.003", 1), ("0.01", 2), ("3.0", 2), ("10.0", 3), ("30.0", 3), ("+Inf", 4)):
-        assert f'slotfilm_learner_batch_wait_s_bucket{{le="{bound}"}} {float(count)}' in text
-    assert "slotfilm_learner_batch_wait_s_count 4.0" in text
-    assert "slotfilm_learner_batch_wait_s_sum 104.012" in text
+        assert (
+            f'ray_slotfilm_learner_batch_wait_s_bucket{{le="{bound}",role="learner",worker=""}} {float(count)}' in text
+        )
+    assert 'ray_slotfilm_learner_batch_wait_s_count{role="learner",worker=""} 4.0' in text
+    assert 'ray_slotfilm_learner_batch_wait_s_sum{role="learner",worker=""} 104.012' in text
 
 
 def test_taken_port_leads_to_the_next_free_one():
@@ -166,8 +168,8 @@ def test_taken_port_leads_to_the_next_free_one():
         assert second.port is not None
         assert first.port < second.port < first.port + 32
         second.write({"updates": 5})
-        assert "slotfilm_updates 5.0" in scrape(second)
-        assert "slotfilm_updates 5.0" not in scrape(first)
+        assert 'ray_slotfilm_updates{role="run",worker=""} 5.0' in scrape(second)
+        assert 'ray_slotfilm_updates{role="run",worker=""} 5.0' not in scrape(first)
     finally:
         first.close()
         second.close()

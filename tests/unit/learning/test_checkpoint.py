@@ -1,5 +1,6 @@
 """Checkpoints on disk: exact, whole or refused, and the newest that can be read."""
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -96,9 +97,32 @@ def test_a_manifest_of_another_make_is_refused(tmp_path: Path, change: dict[str,
     path = tmp_path / "c" / MANIFEST
     manifest = json.loads(path.read_text())
     del manifest["sha256"]
-    path.write_text(json.dumps(manifest | change))
+    changed = manifest | change
+    signature = hashlib.sha256(json.dumps(changed, sort_keys=True).encode()).hexdigest()
+    path.write_text(json.dumps(changed | {"sha256": signature}))
     with pytest.raises(ValueError, match=message):
         read_checkpoint(tmp_path / "c")
+
+
+def test_a_manifest_without_its_hash_is_refused(tmp_path: Path) -> None:
+    write_checkpoint(tmp_path / "c", checkpoint())
+    path = tmp_path / "c" / MANIFEST
+    path.write_text(path.read_text().replace('"sha256": ', '"sha257": '))
+    with pytest.raises(ValueError, match=r"manifest\.json: damaged"):
+        read_checkpoint(tmp_path / "c")
+
+
+def test_strict_reading_names_the_damage_instead_of_going_back(tmp_path: Path) -> None:
+    store = CheckpointStore(tmp_path, keep=2)
+    store.write(checkpoint(), 1)
+    store.write(checkpoint(), 2)
+    damaged = tmp_path / "updates-000000002" / TENSORS
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    found = store.read_last("abc")
+    assert found is not None
+    assert str(damaged) in found[1][0]
+    with pytest.raises(ValueError, match=r"cut short or altered; --checkpoint\.no_strict"):
+        store.read_last("abc", strict=True)
 
 
 def test_another_config_and_a_missing_checkpoint_are_refused(tmp_path: Path) -> None:

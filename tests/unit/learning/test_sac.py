@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from slotfilm_dist.config import EncoderConfig, LrConfig, RunConfig, SacConfig
+from slotfilm_dist.learning import losses
 from slotfilm_dist.learning.off_policy import MAX_SKIPPED, METRICS_EVERY, TrainingDivergedError
 from slotfilm_dist.learning.sac import SacLearner
 from slotfilm_dist.messages import SampleBatch
@@ -134,7 +135,7 @@ def test_entropy_bonus_enters_the_value_target() -> None:
     set_constant(learner.critic, 0.0, 0.0)
     set_constant(learner.value, 0.0)
     found = measured(learner, batch_of())
-    # With one sample for each state, E[(alpha log pi)^2] is at least (alpha E[log pi])^2, and the actor's loss is linear.
+    # One sample for each state: E[(alpha log pi)^2] is at least (alpha E[log pi])^2, and the actor's loss is linear.
     assert found["learner_actor_loss"] == pytest.approx(-0.5 * found["learner_entropy_nats"], rel=1e-4)
     assert found["learner_value_loss"] >= 0.5 * (0.5 * found["learner_entropy_nats"]) ** 2
 
@@ -273,6 +274,19 @@ def test_update_that_is_not_finite_is_skipped_and_counted() -> None:
     assert (learner.updates, learner.metrics()["learner_nonfinite_total"]) == (1, 1)
 
 
+def test_update_whose_gradient_overflows_though_its_loss_is_finite_is_skipped() -> None:
+    learner = build(hidden=(256, 256))
+    batch = batch_of(reward=np.full(8, 6e17, np.float32))
+    before = tensors(learner)
+    with torch.no_grad():
+        target = torch.full((8,), 6e18)
+        assert torch.isfinite(losses.critic_loss(torch.zeros(2, 8), target))
+    learner.update(batch)
+    after = tensors(learner)
+    assert all(torch.equal(before[name], after[name]) for name in before if name != "noise_state")
+    assert (learner.updates, learner.metrics()["learner_nonfinite_total"]) == (0, 1)
+
+
 def test_learner_stops_loudly_when_nothing_is_finite_any_more() -> None:
     learner = build()
     bad = batch_of(reward=np.full(8, np.inf, np.float32))
@@ -283,6 +297,25 @@ def test_learner_stops_loudly_when_nothing_is_finite_any_more() -> None:
         learner.update(bad)
     with pytest.raises(TrainingDivergedError, match=r"10 times in a row at update 1;.*critic_norm"):
         learner.update(bad)
+
+
+def test_annealed_temperature_falls_geometrically_to_its_end_and_stays() -> None:
+    options: dict[str, Any] = {
+        "temperature_mode": "annealed",
+        "temperature": 0.4,
+        "final_temperature": 0.1,
+        "annealing_updates": 4,
+    }
+    learner = build(**options)
+    seen = []
+    for update in range(6):
+        learner.update(batch_of(seed=update))
+        seen.append(float(learner.log_temperature.detach().exp()))
+    assert seen == pytest.approx([0.4 / 4**0.25, 0.2, 0.4 / 4**0.75, 0.1, 0.1, 0.1], rel=1e-5)
+    saved = learner.save()
+    resumed = build(**options | {"annealing_updates": 12})
+    resumed.load(saved)
+    assert float(resumed.log_temperature.detach().exp()) == pytest.approx(0.2, rel=1e-5)
 
 
 @pytest.mark.parametrize("encoder", [STATE_ONLY, replace(SEEING, goal=True)], ids=["state", "slots"])

@@ -1,0 +1,1 @@
+"""Faults on purpose: a real run, real damage, and a table of what was expected and what was observed."""

@@ -1,0 +1,244 @@
+"""The two threads of a learner on a cluster: one fetches batches ahead, the other updates and publishes weights."""
+
+import dataclasses
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import Protocol, runtime_checkable
+
+from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
+from slotfilm_dist.cluster.hub import chunk_updates
+from slotfilm_dist.cluster.messages import AgentSetup, UpdateGrant
+from slotfilm_dist.learning.learner import Learner
+from slotfilm_dist.learning.off_policy import TrainingDivergedError
+from slotfilm_dist.learning.recovery import Recovery
+from slotfilm_dist.messages import SampleBatch, TransitionBlock, WeightSnapshot
+
+ADMIT_S = 0.5
+"""Longest wait of one request for updates; what is due by then is granted."""
+RETRY_S = 0.25
+"""Pause before replay is asked again."""
+REQUEST_BYTES = 32 << 20
+"""Batches of one request together stay below this, unless a single one is larger."""
+
+
+@runtime_checkable
+class UpdateLink(Protocol):
+    """What the learner asks of the hub."""
+
+    def admit_updates(self, max_updates: int, timeout_s: float) -> UpdateGrant:
+        """Wait until updates are due."""
+        ...
+
+    def refund_updates(self, num_updates: int) -> None:
+        """Take back updates that did not happen."""
+        ...
+
+    def publish(self, snapshot: WeightSnapshot) -> None:
+        """Take the newest weights."""
+        ...
+
+    def set_up_agents(self, setup: AgentSetup) -> None:
+        """Take what every policy needs besides the weights."""
+        ...
+
+    def newest_version(self) -> int:
+        """Version of the newest weights, -1 before the first."""
+        ...
+
+
+@runtime_checkable
+class SampleLink(Protocol):
+    """What the learner asks of replay."""
+
+    def sample(self, num_batches: int, batch_size: int) -> list[SampleBatch]:
+        """Draw batches uniformly over the steps of all shards that answer."""
+        ...
+
+    def num_steps(self) -> int:
+        """Steps stored in the shards that answer."""
+        ...
+
+    def insert_all(self, blocks: Iterable[TransitionBlock]) -> int:
+        """Store blocks; gives the steps in them."""
+        ...
+
+
+class Publisher:
+    """Gives a learner's weights to the hub under versions that only grow, also when the learner goes back.
+
+    Args:
+        learner: whose weights.
+        hub: takes them.
+    """
+
+    def __init__(self, learner: Learner, hub: UpdateLink) -> None:
+        self._learner, self._hub = learner, hub
+        self._offset = 0
+
+    def start_over(self) -> WeightSnapshot:
+        """Publish the weights of a learner that has been built anew or has gone back to a checkpoint."""
+        self._offset = max(0, self._hub.newest_version() + 1 - self._learner.updates)
+        return self.publish()
+
+    def publish(self) -> WeightSnapshot:
+        """Publish the weights of now."""
+        snapshot = self._learner.snapshot()
+        snapshot = dataclasses.replace(snapshot, version=snapshot.version + self._offset)
+        self._hub.publish(snapshot)
+        return snapshot
+
+
+class LearningLoops:
+    """Runs two threads from `start` to `stop`.
+
+    *Fetcher*: consumes grants of updates and replay; produces chunks of batches, one ready while the next is fetched.
+    Waits for the limiter, for replay to hold `replay.min_steps`, for a shard's answer, and for room.
+
+    *Updater*: consumes chunks; produces updates and, every `runtime.publish_every`, weights. Waits for a chunk. Updates
+    that stay non-finite take it back to the last checkpoint.
+
+    Both stop within a slice of their waits; updates that were granted and not made are given back. An error stops both
+    and is kept in `error`.
+
+    Args:
+        learner: begun.
+        hub: admits updates.
+        store: gives batches.
+        publisher: of the learner's weights.
+        recovery: for updates that stay non-finite.
+        between_updates: held during an update; whoever holds it sees the learner between two.
+    """
+
+    def __init__(
+        self,
+        learner: Learner,
+        hub: UpdateLink,
+        store: SampleLink,
+        publisher: Publisher,
+        recovery: Recovery,
+        between_updates: threading.Lock,
+    ) -> None:
+        self._learner, self._hub, self._store = learner, hub, store
+        self._publisher, self._recovery, self._state = publisher, recovery, between_updates
+        self._config = learner.config
+        self._stopping = threading.Event()
+        self._ready: queue.Queue[list[SampleBatch]] = queue.Queue(1)
+        self._granted = self._made = 0
+        self.waiting_for = self.error = ""
+        self.waited_s = self.batch_wait_s = self.update_s = 0.0
+        self._threads = [
+            threading.Thread(target=self._guard, args=(loop,), name=loop.__name__.strip("_"), daemon=True)
+            for loop in (self._fetch_loop, self._update_loop)
+        ]
+
+    def start(self) -> None:
+        """Start both threads."""
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self, timeout_s: float) -> None:
+        """Stop after the running update and give back what was granted.
+
+        Raises:
+            RoleSilentError: a thread still runs when time is up.
+        """
+        self._stopping.set()
+        deadline = time.monotonic() + timeout_s
+        for thread in self._threads:
+            thread.join(max(0.0, deadline - time.monotonic()))
+            if thread.is_alive():
+                raise RoleSilentError("learner", f"its thread {thread.name} to end", timeout_s)
+        self._hub.refund_updates(self._granted - self._made)
+        self._granted = self._made
+        self._publisher.publish()
+
+    def _guard(self, loop: Callable[[], None]) -> None:
+        try:
+            loop()
+        except TrainingDivergedError as error:
+            self.error = str(error)
+        except Exception as error:  # told to the driver, which ends or restarts the learner
+            self.error = f"{type(error).__name__}: {error}".splitlines()[0]
+        finally:
+            self._stopping.set()
+
+    def _fetch_loop(self) -> None:
+        chunk = chunk_updates(self._config.schedule.updates_per_step)
+        schema, size = self._learner.schema(), self._config.sac.batch_size
+        chunk = max(1, min(chunk, REQUEST_BYTES // (2 * schema.row_bytes * size)))
+        while not self._stopping.is_set():
+            grant = self._hub.admit_updates(chunk, ADMIT_S)
+            self.waiting_for = grant.waiting_for and f"the limiter: {grant.waiting_for}"
+            if grant.num_updates:
+                self._granted += grant.num_updates
+                self._pass_on(self._fetch(grant.num_updates, size))
+
+    def _fetch(self, num_batches: int, batch_size: int) -> list[SampleBatch]:
+        """Batches, once replay holds enough; none when the loop is told to stop."""
+        wanted = self._config.replay.min_steps
+        while not self._stopping.is_set():
+            try:
+                stored = self._store.num_steps()
+                if stored >= wanted:
+                    return self._store.sample(num_batches, batch_size)
+                self.waiting_for = f"replay to hold {wanted} steps; it holds {stored}"
+            except (RoleLostError, RoleSilentError) as error:
+                self.waiting_for = str(error)
+            self._stopping.wait(RETRY_S)
+        return []
+
+    def _pass_on(self, batches: list[SampleBatch]) -> None:
+        while batches and not self._stopping.is_set():
+            try:
+                self._ready.put(batches, timeout=RETRY_S)
+                return
+            except queue.Full:
+                continue
+
+    def _update_loop(self) -> None:
+        learner, every = self._learner, self._config.runtime.publish_every
+        next_publish = learner.updates + every
+        while not self._stopping.is_set():
+            began = time.monotonic()
+            try:
+                batches = self._ready.get(timeout=RETRY_S)
+            except queue.Empty:
+                self.waited_s += time.monotonic() - began
+                continue
+            self.batch_wait_s = time.monotonic() - began
+            self.waited_s += self.batch_wait_s
+            for batch in batches:
+                if self._stopping.is_set():
+                    break
+                if self._update(batch):
+                    next_publish = learner.updates + every
+                elif learner.updates >= next_publish:
+                    self._publisher.publish()
+                    next_publish = learner.updates + every
+
+    def _update(self, batch: SampleBatch) -> bool:
+        """Make an update; True if it took the learner back to a checkpoint."""
+        began = time.monotonic()
+        with self._state:
+            before = self._learner.updates
+            try:
+                self._learner.update(batch)
+            except TrainingDivergedError as error:
+                lost = self._recovery.roll_back(error)
+                self._give_back(made=lost, granted=1)
+                self._publisher.start_over()
+                return True
+            made = self._learner.updates - before
+        self._made += made
+        if not made:  # skipped for a loss or gradient that was not finite: it is due again
+            self._give_back(made=0, granted=1)
+        self.update_s = time.monotonic() - began
+        return False
+
+    def _give_back(self, *, made: int, granted: int) -> None:
+        """Updates that are due again: some that were made and are lost, some that were granted and not made."""
+        self._made -= made
+        self._granted -= made + granted
+        self._hub.refund_updates(made + granted)

@@ -1,0 +1,1 @@
+"""The study as a grid of trials on Ray Tune."""
