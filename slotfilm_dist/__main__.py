@@ -17,7 +17,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "perceive": ("commands.perceive:main", "attention, positions and visibility on an image, video, webcam or stream"),
     "watch": ("commands.watch:main", "the metrics of a run, live in a terminal"),
     "chaos": ("commands.chaos:main", "damage a real run on purpose: what should follow, what does"),
-    "report": ("commands.report:main", "write the page of a run"),
+    "report": ("commands.report:main", "the page of a run; of many, every figure and table beside the paper's"),
     "export": ("commands.export:main", "the trained policy as files that need neither simulator nor Ray"),
     "variants": ("commands.listing:variants", "the agents of the study, the tasks, the presets"),
     "cost": ("commands.listing:cost", "parameters, latency and memory of every variant"),

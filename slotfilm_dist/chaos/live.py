@@ -29,8 +29,8 @@ from slotfilm_dist.stopping import Interrupted, StopFlag
 from slotfilm_dist.variants import apply_variant
 
 POLL_S = 0.05
-STEP_LIMIT_S = 5.0
-"""A step of the toy environment takes less than a millisecond; the production limit of 30 s would only cost time."""
+STEP_LIMIT_S = 10.0
+"""A step of the toy environment takes less than a millisecond, but an overloaded machine may stop for seconds."""
 SNAPSHOT_S = 10.0
 """Seconds between snapshots of replay, often enough to be met by a plan of minutes."""
 DISK_BYTES = 64 << 20

@@ -276,7 +276,7 @@ class RayBackend:
         return self._learner
 
     def _acting_weights(self) -> WeightSnapshot | None:
-        """What an evaluation plays with; while training goes on, the learner keeps all of it, as it may become `best`."""
+        """What an evaluation plays with; while training goes on, the learner keeps it whole: it may become `best`."""
         with contextlib.suppress(RoleLostError, RoleSilentError):  # the next report replaces it
             if self._training:
                 return self._learning.call("hold_candidate")

@@ -1,10 +1,12 @@
 """`slotfilm chaos`: damages a real run on purpose and says what followed."""
 
+import signal
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from types import FrameType
 
 from slotfilm_dist.commands.options import Parser
 
@@ -38,6 +40,7 @@ def main(arguments: Sequence[str]) -> int:
     from slotfilm_dist.chaos.runner import carry_out
     from slotfilm_dist.chaos.soak import soak
 
+    signal.signal(signal.SIGTERM, _leave)
     environment, outcomes = "simulator" if options.simulator else "toy", list[Outcome]()
     with tempfile.TemporaryDirectory(prefix="chaos-") as scratch:
         folder = Path(options.keep or scratch)
@@ -55,3 +58,8 @@ def main(arguments: Sequence[str]) -> int:
     shape = as_markdown if options.markdown else as_text
     print(as_json(outcomes, options.seed) if options.json else shape(outcomes))
     return 0 if all(outcome.holds for outcome in outcomes) else 1
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    """End by way of every `finally`: what was mounted and started here must not stay."""
+    sys.exit(128 + number)

@@ -41,8 +41,8 @@ def components_section(draft: Draft, item: paper.Item) -> Section:
         panel = ("", "mean of a step, largest = 1", draw)
         path = draw_lines([panel], draft.picture(item.anchor), xlabel="environment steps")
         text = (
-            f"Components divided by their largest value, exponential moving average, of slotfilm; interquartile mean over "
-            f"seeds ({len(runs)} at hand) with a 95 % bootstrap band, which a single seed does not have."
+            f"Components divided by their largest value, exponential moving average, of slotfilm; interquartile mean "
+            f"over seeds ({len(runs)} at hand) with a 95 % bootstrap band, which a single seed does not have."
         )
         section.blocks.extend([Picture(path=path, title=item.title, text=text), draft.made_by(runs)])
         draft.tables[item.anchor] = [{"seed": run.seed} | row for run, rows in by_run for row in rows]
@@ -83,7 +83,8 @@ def windows_section(draft: Draft, item: paper.Item) -> Section:
         )
         head = ("window, component", "the paper", "here, IQM over seeds", "deviation within a run", "each seed")
         section.blocks.extend([Table(caption=caption, head=head, rows=tuple(rows)), draft.made_by(runs)])
-    section.blocks.append(Printed(lines=item.printed))
+    lines = () if rows else tuple(_window_in_words(window) for window in WINDOWS)
+    section.blocks.append(Printed(lines=(*item.printed, *lines)))
     if not runs:
         section.blocks.append(_no_components(draft))
     elif absent:
@@ -117,7 +118,8 @@ def probes_section(draft: Draft, item: paper.Item) -> Section:
         commands = tuple(_probe_command(m) for m in found)
         table = Table(caption=caption, head=head, rows=tuple(rows))
         section.blocks.extend([table, Commands(text="Measured by", commands=commands)])
-    section.blocks.append(Printed(lines=item.printed))
+    lines = () if found else tuple(_in_words(name, labels, paper.TABLE_3[name]) for name in item.variants)
+    section.blocks.append(Printed(lines=(*item.printed, *lines)))
     section.blocks.extend(_unprobed(draft, item, {m.run.variant for m in found}))
     return section
 
@@ -148,6 +150,16 @@ def robustness_section(draft: Draft) -> Section:
             {"variant": m.run.variant, "seed": m.run.seed} | row for m in found for row in m.values.get("rows", [])
         ]
     return section
+
+
+def _in_words(name: str, labels: Sequence[str], values: Sequence[str]) -> str:
+    """A printed row for a table that cannot be shown."""
+    return f"{name}: " + ", ".join(f"{label} {value}" for label, value in zip(labels, values, strict=False))
+
+
+def _window_in_words(window: str) -> str:
+    values = [f"{mean} ± {std} %" for mean, std in (paper.TABLE_2[window, term] for term in TABLE_TERMS)]
+    return _in_words(window, [term.replace("_", " ") for term in TABLE_TERMS], values)
 
 
 def _has_terms(run: StudyRun) -> bool:

@@ -126,7 +126,8 @@ def returns_table(numbers: Sequence[VariantNumbers], episode_steps: int, printed
     bound = f"At most {html.number(10 * episode_steps, 0)} in an episode of {episode_steps} steps"
     other = f", {html.number(10 * PAPER_STEPS, 0)} in the paper's of {PAPER_STEPS}" if episode_steps != 400 else ""
     caption = (
-        f"Return at reward scale 10, interquartile mean over seeds with 95 % stratified bootstrap interval, which a single seed does not have. {bound}"
+        "Return at reward scale 10, interquartile mean over seeds with 95 % stratified bootstrap interval, which a "
+        f"single seed does not have. {bound}"
         f"{other}. Area: mean height of the curve over the steps that the variant and slotfilm both have."
     )
     return Table(caption=caption, head=(*_HEAD, "the paper") if printed else _HEAD, rows=tuple(rows))

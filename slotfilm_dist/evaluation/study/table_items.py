@@ -82,7 +82,8 @@ def _costs(draft: Draft, section: Section) -> None:
     proposed = next((row for row in draft.costs if row.get("variant") == "slotfilm"), None)
     if proposed is None:
         text = f"The study's folder holds no {COST_FILE} with a row of slotfilm."
-        section.blocks.append(Missing(text=text, commands=(command,)))
+        lines = tuple(f"{name}: {printed}" for name, printed, _ in paper.TABLE_A3)
+        section.blocks.extend([Printed(lines=lines), Missing(text=text, commands=(command,))])
         return
     draft.tables[section.anchor] = [dict(row) for row in draft.costs]
     rows = []
