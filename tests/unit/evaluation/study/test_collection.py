@@ -2,6 +2,7 @@ import dataclasses
 
 import pytest
 
+from slotfilm_dist.config import load_config, save_config
 from slotfilm_dist.evaluation.study.collection import Trial, collect_study
 
 
@@ -66,6 +67,15 @@ def test_an_unfinished_run_is_in_no_number_but_known(tmp_path, write_small_run):
     study = collect_study(tmp_path)
     assert [run.seed for run in study.runs] == [0]
     assert [run.seed for run in study.unfinished] == [1]
+
+
+def test_a_final_evaluation_from_before_the_run_was_prolonged_does_not_end_it(tmp_path, write_small_run):
+    path = write_small_run(tmp_path, "slotfilm", 0)
+    config = load_config(path / "config.json")
+    longer = dataclasses.replace(config, schedule=dataclasses.replace(config.schedule, total_steps=3000))
+    save_config(longer, path / "config.json")
+    study = collect_study(tmp_path)
+    assert (len(study.runs), len(study.unfinished)) == (0, 1)
 
 
 def test_the_same_variant_and_seed_counts_once(tmp_path, write_small_run):

@@ -62,3 +62,11 @@ def test_without_the_proposed_agent_there_is_no_improvement_but_all_else(tmp_pat
     numbers = by_variant(tmp_path)["state_only"]
     assert numbers.over_proposed is None
     assert math.isfinite(numbers.area.value)
+
+
+def test_area_stops_where_the_proposed_agent_s_last_episode_ended(tmp_path, write_small_run):
+    episodes = write_small_run(tmp_path, "slotfilm", 0) / "episodes.jsonl"
+    episodes.write_text("".join(episodes.read_text().splitlines(keepends=True)[:-2]))
+    write_small_run(tmp_path, "state_only", 0)
+    numbers = by_variant(tmp_path)
+    assert [numbers[name].runs[0].until for name in ("slotfilm", "state_only")] == [1400, 1400]
