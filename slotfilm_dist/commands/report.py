@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 def main(arguments: Sequence[str]) -> int:
     """Write the report; gives the exit code."""
     options = _parser().parse_args(arguments)
-    folder = Path(options.dir)
+    folder = Path(options.run)
 
     from slotfilm_dist.evaluation.study.collection import is_run
 
@@ -47,7 +47,7 @@ def _parser() -> Parser:
         "and table of the paper that the runs support, beside what the paper printed, as report.html, report.md, "
         "figures/*.png and tables/*.csv; what is missing is named with the command that would make it.",
     )
-    parser.add_argument("dir", help="directory of a run, folder of runs, or directory of a grid")
+    parser.add_argument("run", help="directory of a run, folder of runs, or directory of a grid")
     parser.add_argument("--out", default="", metavar="DIR", help="folder of a study's report (default: report in it)")
     parser.add_argument("--json", action="store_true", help="print what was written as one JSON object")
     return parser

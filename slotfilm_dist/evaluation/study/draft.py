@@ -48,6 +48,7 @@ def shown(estimate: Estimate, digits: int = 0) -> str:
     low, high = estimate.interval
     if not math.isfinite(estimate.value):
         return NONE
+    digits = max(digits, 1) if abs(estimate.value) < 100 else digits
     value = html.number(estimate.value, digits)
     return f"{value}\N{NO-BREAK SPACE}{html.interval(low, high, digits=digits)}" if math.isfinite(low) else value
 
