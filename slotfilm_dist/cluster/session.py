@@ -155,7 +155,7 @@ class Session:
             include_dashboard=False,
             log_to_driver=False,
             logging_level=logging.ERROR,
-            _temp_dir=str(self._folder),
+            _temp_dir=str(self._folder / "ray"),  # Ray lets everybody write there
             _node_ip_address="127.0.0.1",
             _metrics_export_port=metrics_port or None,
             # Roles at the usual priority: at Ray's own 15 anything else on the machine would starve them.

@@ -68,7 +68,7 @@ def written(tmp_path: Path) -> Callable[[], set[str]]:
     """Keys of all metrics that the run has written to its own file, once it trains."""
 
     def read() -> set[str]:
-        path = tmp_path / "run" / "metrics.jsonl"
+        path = tmp_path / "watched" / "metrics.jsonl"
         text = path.read_text() if path.exists() else ""
         return set(re.findall(r'"(\w+(?:/\w+)?)":', text)) if "learner_critic_loss" in text else set()
 
@@ -79,17 +79,18 @@ def test_every_metric_of_a_run_is_at_rays_agent_under_its_name(
     start: Start, config: RunConfig, tmp_path: Path, written: Callable[[], set[str]]
 ) -> None:
     with RunDirectory(
-        tmp_path / "run", replace(config, checkpoint=replace(config.checkpoint, save_replay=False))
+        tmp_path / "watched", replace(config, checkpoint=replace(config.checkpoint, save_replay=False))
     ) as run:
         backend, stop = start(run.config, run.path), StopFlag()
-        watcher = Watcher("run", stop, lambda: exported(written()))
+        watcher = Watcher("watched", stop, lambda: exported(written()))
         with pytest.raises(Exception, match="stopped by"):
             Pipeline(run, backend, tmp_path / "artifacts", watcher, stop).execute()
     keys = written()
     assert exported(keys) - watcher.names == set()
     assert {"worker_env_steps_total", "limiter_ratio", "weights_age_s", "replay_stored_steps"} <= keys
     for (name, worker), (labels, _) in watcher.samples.items():
-        metric = METRICS[re.sub("_(bucket|count|sum)$", "", name.removeprefix(EXPORT_PREFIX))]
+        plain = name.removeprefix(EXPORT_PREFIX)
+        metric = METRICS.get(plain) or METRICS[re.sub("_(bucket|count|sum)$", "", plain)]
         assert labels["variant"] == "state_only"
         assert labels["seed"] == "0"
         assert labels["role"] == metric.role

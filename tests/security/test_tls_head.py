@@ -27,7 +27,7 @@ from slotfilm_dist.doctor import check_dashboards
 START_S = 90.0
 NODES = "/ray.rpc.NodeInfoGcsService/GetAllNodeInfo"
 TOKEN = "5" * 64
-TASK = "import ray, sys; ray.init(address=sys.argv[1]); print('sum', ray.get(ray.remote(sum).remote([1, 2])))"
+TASK = "import ray, sys; ray.init(address=sys.argv[1]); print('sum', ray.get(ray.remote(lambda: 1 + 2).remote()))"
 
 Signed = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
 
@@ -107,7 +107,7 @@ def head() -> Iterator[TlsHead]:
         try:
             url = f"http://127.0.0.1:{dashboard}"
             deadline = time.monotonic() + START_S
-            while get(f"{url}/api/healthz") != 200:
+            while get(f"{url}/api/version", TOKEN) != 200:
                 assert time.monotonic() < deadline, (folder / "log").read_text()
                 assert starter.poll() is None, (folder / "log").read_text()
                 time.sleep(0.5)
