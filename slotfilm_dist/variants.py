@@ -165,9 +165,9 @@ def end_to_end(base: RunConfig) -> RunConfig:
 
 def oracle_state(base: RunConfig) -> RunConfig:
     """State and the objects' true poses, without a camera: validates task and learner, no part of the study."""
-    fields = (*PROPRIO_FIELDS, "object_poses", "tcp_to_object", "object_to_goal", "object_to_goal_near")
+    fields = (*PROPRIO_FIELDS, "object_poses", "tcp_to_object", "object_to_goal")
     obs = base.obs
-    state_dim = 35 + 7 * obs.num_objects + 9
+    state_dim = 35 + 7 * obs.num_objects + 6
     return state_only(replace(base, obs=replace(obs, state_fields=fields, state_dim=state_dim)))
 
 

@@ -101,6 +101,15 @@ def test_state_vector_is_made_of_its_fields_and_the_reward_of_its_terms() -> Non
     env.close()
 
 
+def test_near_field_is_the_way_to_the_goal_squeezed() -> None:
+    fields = ("object_to_goal", "object_to_goal_near")
+    obs = replace(RunConfig().obs, state_fields=fields, state_dim=6)
+    env = WristEnv(replace(RunConfig(), obs=obs), camera=False)
+    proprio = env.reset([5]).proprio
+    np.testing.assert_allclose(proprio[:, 3:], np.tanh(proprio[:, :3] / 0.02), rtol=1e-5)
+    env.close()
+
+
 def test_cpu_reader_equals_maniskills_batched_properties_through_a_grasp() -> None:
     env = make()
     expert = ExpertPolicy(env)

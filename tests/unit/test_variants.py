@@ -32,7 +32,7 @@ def test_variants_differ_from_the_proposed_agent_and_from_each_other() -> None:
         ("reward_scale_15", "sac.reward_scale", 15.0),
         ("slots_4", "encoder.num_slots", 4),
         ("end_to_end", "sac.end_to_end", True),
-        ("oracle_state", "obs.state_dim", 35 + 14 + 9),
+        ("oracle_state", "obs.state_dim", 35 + 14 + 6),
     ],
 )
 def test_variant_changes_what_its_name_says(name: str, field: str, value: object) -> None:
