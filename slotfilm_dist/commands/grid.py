@@ -1,5 +1,6 @@
 """`slotfilm grid`: every variant and seed of the study on Ray Tune; the same command goes on where it stopped."""
 
+import contextlib
 import json
 import os
 import sys
@@ -44,9 +45,13 @@ def main(arguments: Sequence[str]) -> int:
     grid = _directory(options, base)
     if options.dry_run:
         return _dry_run(options, fields, grid, jobs)
+    ledger = Ledger(grid)
     with held_by_one_driver(grid):
         write_grid_file(grid, _settings(base), command := ("grid", *arguments))
-        return _run(options, fields, grid, jobs, Ledger(grid), command)
+        with contextlib.redirect_stdout(sys.stderr):  # Ray's messages keep out of --json
+            signalled = _run(options, fields, grid, jobs, ledger, command)
+        code = _outcome(options, grid, jobs, ledger)
+        return signalled or code
 
 
 def _parser() -> Parser:
@@ -196,6 +201,7 @@ def _run(
     ledger: "Ledger",
     command: tuple[str, ...],
 ) -> int:
+    """Do what is left to do; gives 128 + n after signal n, else 0."""
     from slotfilm_dist.cluster.session import Session
     from slotfilm_dist.stopping import Interrupted, StopFlag
     from slotfilm_dist.tuning.board import Board
@@ -207,7 +213,7 @@ def _run(
     artifacts = Path(options.artifacts).resolve()
     wanted = {job.key for job in jobs_to_do(jobs, ledger, artifacts)}
     if not wanted:
-        return _outcome(options, grid, jobs, ledger)
+        return 0
     board = Board([(job, ledger.read(job)) for job in jobs if job.kind == "trial" or job.key in wanted])
     stop = StopFlag()
     session = Session()
@@ -232,11 +238,10 @@ def _run(
             stop.check()
     except Interrupted as interruption:
         board.say(f"{interruption}; go on with the same command: slotfilm {' '.join(command)}")
-        _outcome(options, grid, jobs, ledger)
         return interruption.exit_code
     finally:
         session.close()
-    return _outcome(options, grid, jobs, ledger)
+    return 0
 
 
 def _outcome(options: "argparse.Namespace", grid: Path, jobs: "Sequence[Job]", ledger: "Ledger") -> int:

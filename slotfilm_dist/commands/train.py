@@ -1,5 +1,6 @@
 """`slotfilm train`: a run from nothing to its report, or on from where it stopped."""
 
+import contextlib
 import json
 import sys
 from collections.abc import Sequence
@@ -74,7 +75,8 @@ def _resumed_config(path: Path, fields: Sequence[str]) -> RunConfig:
 def _execute(path: Path, config: RunConfig, artifacts: Path, *, as_json: bool) -> int:
     from slotfilm_dist.driver import drive
 
-    code = drive(path, config, artifacts, _backend)
+    with contextlib.redirect_stdout(sys.stderr):  # Ray's messages keep out of --json
+        code = drive(path, config, artifacts, _backend)
     if code == 0 and as_json:
         json.dump({"run": str(path), "report": str(path / "report.html"), **_result(path)}, sys.stdout)
         print()

@@ -29,6 +29,13 @@ def checkpoint(number: int = 1, config_hash: str = "abc") -> Checkpoint:
     return Checkpoint(tensors=tensors, values={"updates": number, "nested": {"big": 2**100}}, config_hash=config_hash)
 
 
+def read_or_refusal(folder: Path) -> Checkpoint | str:
+    try:
+        return read_checkpoint(folder)
+    except ValueError as error:
+        return str(error)
+
+
 def flip_bit(path: Path, position: int) -> None:
     content = bytearray(path.read_bytes())
     content[position] ^= 1
@@ -55,10 +62,9 @@ def test_a_flipped_bit_anywhere_is_refused_and_the_file_named(tmp_path: Path, na
     values = json.loads((tmp_path / "c" / MANIFEST).read_text())
     for position in range(0, len(original), 7):
         flip_bit(path, position)
-        try:
-            found = read_checkpoint(tmp_path / "c")
-        except ValueError as error:
-            assert str(tmp_path / "c") in str(error)
+        found = read_or_refusal(tmp_path / "c")
+        if isinstance(found, str):
+            assert str(tmp_path / "c") in found
         else:
             # Only layout, or the name of the signature itself, may change unnoticed.
             assert found.values == values["values"]
@@ -169,7 +175,7 @@ def test_store_without_checkpoints_gives_none_and_with_bad_ones_refuses(tmp_path
     store = CheckpointStore(tmp_path / "checkpoints", keep=2)
     assert store.read_last("abc") is None
     store.write(checkpoint(1), 1)
-    with pytest.raises(ValueError, match="no checkpoint can be used: .*updates-000000001"):
+    with pytest.raises(ValueError, match=r"no checkpoint can be used: .*updates-000000001"):
         store.read_last("other")
 
 
