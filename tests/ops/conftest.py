@@ -11,7 +11,7 @@ import time
 import urllib.error
 import urllib.parse
 import urllib.request
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -146,9 +146,22 @@ def watched_config(metrics_port: int) -> RunConfig:
 
 
 @pytest.fixture(scope="session")
-def watched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WatchedRun]:
-    if shutil.which("prometheus") is None:
-        pytest.skip("needs the programs of ops/test-packages.txt: bash ops/setup.sh --test")
+def program() -> Callable[[str], str]:
+    """Where a program of ops/test-packages.txt is; without it a test is skipped, and fails where it must be there."""
+
+    def find(name: str) -> str:
+        path = shutil.which(name)
+        if path is None:
+            give_up = pytest.fail if os.environ.get("CI") else pytest.skip
+            give_up(f"needs {name}, a program of ops/test-packages.txt: bash ops/setup.sh --test")
+        return path
+
+    return find
+
+
+@pytest.fixture(scope="session")
+def watched(tmp_path_factory: pytest.TempPathFactory, program: Callable[[str], str]) -> Iterator[WatchedRun]:
+    program("prometheus")
     folder = tmp_path_factory.mktemp("watched")
     config = watched_config(free_port())
     prometheus = Prometheus(folder, free_port())

@@ -1,8 +1,8 @@
 """A real Prometheus with the project's configuration sees every metric of a run, and its rules do what they say."""
 
 import math
-import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -65,11 +65,6 @@ RANGES = {
 """Where values must lie beyond what their unit says."""
 
 
-def needs(program: str) -> None:
-    if shutil.which(program) is None:
-        pytest.skip("needs the programs of ops/test-packages.txt: bash ops/setup.sh --test")
-
-
 def rules(kind: str) -> dict[str, dict[str, Any]]:
     """Rules of a kind, `record` or `alert`, by name."""
     groups = [group for path in sorted(RULES.glob("*.yml")) for group in yaml.safe_load(path.read_text())["groups"]]
@@ -101,17 +96,23 @@ def exported(metric: Metric) -> str:
     return f"sum by (run, reason, term) ({metric.exported_name}{'_count' if metric.kind == 'histogram' else ''})"
 
 
-def promtool(*arguments: str) -> subprocess.CompletedProcess[str]:
-    needs("promtool")
-    return subprocess.run(["promtool", *arguments], cwd=OPS, capture_output=True, text=True, timeout=60)
+@pytest.fixture
+def promtool(program: Callable[[str], str]) -> Callable[..., subprocess.CompletedProcess[str]]:
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        words = [program("promtool"), *arguments]
+        return subprocess.run(words, cwd=OPS, capture_output=True, text=True, timeout=60)
+
+    return run
 
 
-def test_configuration_and_rules_are_valid() -> None:
+def test_configuration_and_rules_are_valid(promtool: Callable[..., subprocess.CompletedProcess[str]]) -> None:
     answer = promtool("check", "config", "prometheus.yml")
     assert answer.returncode == 0, answer.stdout + answer.stderr
 
 
-def test_every_alert_fires_and_stays_quiet_when_it_should() -> None:
+def test_every_alert_fires_and_stays_quiet_when_it_should(
+    promtool: Callable[..., subprocess.CompletedProcess[str]],
+) -> None:
     answer = promtool("test", "rules", "prometheus/tests/alerts.yml")
     assert answer.returncode == 0, answer.stdout + answer.stderr
 
