@@ -9,7 +9,7 @@ import ray
 import ray.exceptions
 
 from slotfilm_dist.cluster.actors import CONCURRENCY
-from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
+from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError, RoleUnreachableError
 
 ANSWER_S = 60.0
 """Longest wait for an answer that takes no time to give."""
@@ -67,7 +67,7 @@ class ActorLink:
         """The result of `begin`.
 
         Raises:
-            RoleLostError: the process is gone.
+            RoleLostError: the process is gone; `RoleUnreachableError` while Ray does not know why.
             RoleSilentError: no answer in time.
             Exception: what the role itself raised.
         """
@@ -78,6 +78,8 @@ class ActorLink:
         except ray.exceptions.RayTaskError as error:
             cause = error.cause if isinstance(error.cause, Exception) else error
             raise cause from None
+        except ray.exceptions.ActorUnavailableError as error:
+            raise RoleUnreachableError(self.name, "crash", _one_line(str(error))) from None
         except ray.exceptions.RayError as error:
             raise RoleLostError(self.name, _reason(error), _one_line(str(error))) from None
 
@@ -98,7 +100,8 @@ def _reason(error: ray.exceptions.RayError) -> str:
         return "memory"
     if getattr(error, "preempted", False):
         return "preempted"
-    return "node_lost" if "node died" in text or "node was terminated" in text else "crash"
+    lost = ("node died", "node has died", "node was terminated")
+    return "node_lost" if any(words in text for words in lost) else "crash"
 
 
 def _one_line(text: str) -> str:

@@ -18,6 +18,10 @@ class RoleLostError(Exception):
         return type(self), (self.name, self.reason, self.cause)
 
 
+class RoleUnreachableError(RoleLostError):
+    """The process of a role takes no calls, and Ray does not know yet whether it, or its whole node, is gone."""
+
+
 class RoleSilentError(Exception):
     """A role did not answer in time.
 

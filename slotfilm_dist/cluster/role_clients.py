@@ -8,13 +8,16 @@ from typing import Any
 from slotfilm_dist.backend import Player
 from slotfilm_dist.cluster.actors import LearnerActor, PlayerActor, WorkerActor
 from slotfilm_dist.cluster.clients import ANSWER_S, ActorLink, is_ready
-from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
+from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError, RoleUnreachableError
 from slotfilm_dist.cluster.hub_client import HubClient
 from slotfilm_dist.cluster.inference_client import InferenceClient
 from slotfilm_dist.cluster.messages import AgentSetup, LearnerStatus, WorkerBeat
 from slotfilm_dist.cluster.replay_client import ReplayClient
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.messages import TransitionBlock, WeightSnapshot
+
+UNREACHABLE_S = 20.0
+"""Longest wait for Ray to say why a worker takes no calls: a lost node shows after some missed health checks."""
 
 
 class WorkerClient:
@@ -84,7 +87,12 @@ class WorkerClient:
             self._question = self._link.begin("beat")
         if is_ready(self._question):
             question, self._question = self._question, None
-            self._last = self._link.answer(question, "how it does", ANSWER_S)
+            try:
+                self._last = self._link.answer(question, "how it does", ANSWER_S)
+            except RoleUnreachableError:
+                if self.silent_s > UNREACHABLE_S:
+                    raise
+                return self._last
             self._heard_at = time.monotonic()
         return self._last
 
