@@ -546,6 +546,9 @@ class RuntimeConfig:
     """Steps a worker collects before it sends them."""
     publish_every: int = 50
     """Updates between weight snapshots."""
+    max_staleness_s: float = 120.0
+    """Longest time that workers act without word from the hub that their weights are the newest, in seconds; then they
+    pause until it comes (`ray` mode). A healthy run has it about once a second, however rarely weights change."""
     exact_resume: bool = False
     """Build the simulator anew for every training episode (`local` mode; half a second each): a resumed run then equals
     an uninterrupted one bit for bit. Without it PhysX's last digits depend on the episodes before."""
@@ -555,6 +558,7 @@ class RuntimeConfig:
 
     def __post_init__(self) -> None:
         _positive("runtime", self, "num_workers", "worker_threads", "block_steps", "publish_every")
+        _positive("runtime", self, "max_staleness_s")
         _not_negative("runtime", self, "learner_threads", "max_workers")
         check(
             self.max_workers == 0 or self.max_workers >= self.num_workers,

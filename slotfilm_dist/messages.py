@@ -50,6 +50,8 @@ class StepResult:
     """Any finger touches the object with more than 0.5 N."""
     reward_terms: Float32[np.ndarray, "envs terms"]
     """The reward's weighted components, named by the environment's `reward_term_names`; they add up to the reward."""
+    reward_inputs: Float32[np.ndarray, "envs inputs"] | None = None
+    """What the reward was computed from, whatever its config; None where the environment brings its own reward."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -110,6 +112,8 @@ class TransitionBlock:
     """The clock ran out: bootstrap."""
     is_step: Bool[np.ndarray, " rows"]
     """The row holds a step, not only a last frame."""
+    reward_inputs: Float32[np.ndarray, "rows inputs"] | None = None
+    """What the reward was computed from, if the environment tells; kept in shared data, not in replay."""
     episodes: tuple[EpisodeSummary, ...] = ()
     """Episodes that ended within the block."""
 

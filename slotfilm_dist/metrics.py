@@ -2,7 +2,8 @@
 
 A name is `role_thing_unit`; the axes `time_s`, `env_steps`, `updates` and `phase` have no role. A metric with a label
 is written under `name/label`, as `worker_restarts_total/crash`. A counter's value is its total since the run began,
-over all restarts; a histogram's value is one observation; a gauge's value replaces the one before.
+over all restarts, or since this start of the run where it is marked `from_zero`; a histogram's value is one
+observation; a gauge's value replaces the one before.
 """
 
 import difflib
@@ -47,6 +48,8 @@ class Metric:
     """Labels allowed; any word when empty."""
     by_worker: bool = False
     """On a cluster every worker's process exports it itself, counted since that process began."""
+    from_zero: bool = False
+    """Counts rare events of this start of the run; exported as 0 before the first one, which then is an increase."""
 
     @property
     def role(self) -> str:
@@ -63,10 +66,12 @@ def _gauge(name: str, unit: str, text: str) -> Metric:
     return Metric(name, unit, "gauge", text)
 
 
-def _counter(
-    name: str, unit: str, text: str, label: str = "", label_values: tuple[str, ...] = (), *, by_worker: bool = False
-) -> Metric:
-    return Metric(name, unit, "counter", text, label, label_values, by_worker)
+def _counter(name: str, unit: str, text: str, *, by_worker: bool = False, from_zero: bool = False) -> Metric:
+    return Metric(name, unit, "counter", text, by_worker=by_worker, from_zero=from_zero)
+
+
+def _restarts(name: str, text: str) -> Metric:
+    return Metric(name, "restarts", "counter", text, "reason", RESTART_REASONS, from_zero=True)
 
 
 def _duration(name: str, text: str, *, by_worker: bool = False) -> Metric:
@@ -96,7 +101,7 @@ _WORKER = (
     _counter("worker_wait_s_total", "s", "Time the workers have waited for the limiter and replay.", by_worker=True),
     _gauge("worker_wait_share", "share", "Share of the workers' time spent waiting."),
     _counter("worker_nonfinite_total", "steps", "Steps refused for a non-finite reward, state or picture."),
-    _counter("worker_restarts_total", "restarts", "Workers replaced, by reason.", "reason", RESTART_REASONS),
+    _restarts("worker_restarts_total", "Workers replaced, by reason."),
 )
 
 _REPLAY = (
@@ -110,7 +115,7 @@ _REPLAY = (
     _counter("replay_duplicate_blocks_total", "blocks", "Blocks refused because they had been stored before."),
     _counter("replay_missing_blocks_total", "blocks", "Gaps in the workers' block numbers."),
     _gauge("replay_shards_alive_count", "shards", "Shards that answer."),
-    _counter("replay_restarts_total", "restarts", "Shards replaced, by reason.", "reason", RESTART_REASONS),
+    _restarts("replay_restarts_total", "Shards replaced, by reason."),
 )
 
 _LIMITER = (
@@ -132,10 +137,7 @@ _INFERENCE = (
     _counter("inference_steps_total", "steps", "Observations acted on by central inference, since its process began."),
     _counter("inference_busy_s_total", "s", "Time that central inference has computed, since its process began."),
     _gauge("inference_batch_steps", "steps", "Mean number of observations that central inference computes at once."),
-    _counter(
-        *("inference_restarts_total", "restarts", "Central inference processes replaced, by reason."),
-        *("reason", RESTART_REASONS),
-    ),
+    _restarts("inference_restarts_total", "Central inference processes replaced, by reason."),
 )
 
 _LEARNER = (
@@ -166,7 +168,7 @@ _LEARNER = (
     _gauge("learner_goal_gate", "share", "Mean weight of the goal slot in the two-way gate."),
     _counter("learner_nonfinite_total", "updates", "Updates skipped for a non-finite loss or gradient."),
     _counter("learner_rollbacks_total", "rollbacks", "Returns to a checkpoint after non-finite updates in a row."),
-    _counter("learner_restarts_total", "restarts", "Learners replaced, by reason.", "reason", RESTART_REASONS),
+    _restarts("learner_restarts_total", "Learners replaced, by reason."),
 )
 
 _EPISODE = (
@@ -213,12 +215,12 @@ _CHECKPOINT = (
     _gauge("checkpoint_bytes", "bytes", "Size of the last checkpoint."),
     _duration("checkpoint_write_s", "Time to write one checkpoint."),
     _counter("checkpoint_written_total", "checkpoints", "Checkpoints committed."),
-    _counter("checkpoint_failed_total", "checkpoints", "Checkpoints that could not be written."),
+    _counter("checkpoint_failed_total", "checkpoints", "Checkpoints that could not be written.", from_zero=True),
 )
 
 _SINK = (
-    _counter("sink_nonfinite_total", "values", "Metric values that were not finite, written as null."),
-    _counter("sink_failures_total", "writes", "Writes of metrics that failed in one of the sinks."),
+    _counter("sink_nonfinite_total", "values", "Metric values that were not finite, written as null.", from_zero=True),
+    _counter("sink_failures_total", "writes", "Writes of metrics that failed in one of the sinks.", from_zero=True),
 )
 
 METRICS: dict[str, Metric] = {
@@ -253,6 +255,12 @@ def find_metric(key: str) -> tuple[Metric, str]:
     if metric.label_values and label not in metric.label_values:
         raise ValueError(f"metric {key!r}: {metric.label} must be one of {', '.join(metric.label_values)}")
     return metric, label
+
+
+def zero_counters() -> dict[str, float]:
+    """Every key of the counters marked `from_zero`, at zero."""
+    counters = [metric for metric in METRICS.values() if metric.from_zero]
+    return {"/".join(filter(None, (m.name, label))): 0.0 for m in counters for label in m.label_values or ("",)}
 
 
 def check_names(keys: Iterable[str]) -> None:

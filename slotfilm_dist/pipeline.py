@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from slotfilm_dist.artifacts import sole_maker
 from slotfilm_dist.backend import Backend, Player, RunFailedError, TrainReport
 from slotfilm_dist.config import RunConfig
+from slotfilm_dist.envs.reward import num_reward_inputs
 from slotfilm_dist.evaluation.page import write_page
 from slotfilm_dist.evaluation.record import Evaluation, save_evaluation, summarize
 from slotfilm_dist.learning.learner import dataset_hash, dataset_schema, pretrain_hash
@@ -85,16 +87,36 @@ class Pipeline:
             self._sink.close()
         return write_page(self._run.path)
 
+    def make_artifacts(self, *, encoder: bool) -> None:
+        """Make the random policy's data and, where asked for, the pre-trained encoder, unless they are there.
+
+        Raises:
+            Interrupted: a stop was asked for; what was made so far is kept and gone on with.
+        """
+        try:
+            dataset = self._collect()
+            if encoder:
+                self._pretrain(dataset)
+        finally:
+            self._sink.close()
+
     def _collect(self) -> Path:
         """The random policy's data, from the artifacts where they are there."""
+        folder = self._artifacts / f"random-{dataset_hash(self._config)}"
+        if not (folder / MANIFEST).exists():
+            with sole_maker(folder, self._progress, self._stop):
+                if not (folder / MANIFEST).exists():
+                    self._make_dataset(folder)
+                    return folder
+        self._progress.say(f" collect  random-policy data is there: {folder}")
+        return folder
+
+    def _make_dataset(self, folder: Path) -> None:
         config = self._config
-        folder = self._artifacts / f"random-{dataset_hash(config)}"
-        if (folder / MANIFEST).exists():
-            self._progress.say(f" collect  random-policy data is there: {folder}")
-            return folder
         wanted = config.schedule.random_steps
         self._progress.begin("collect", f"{wanted} steps of the random policy")
-        schema = dataset_schema(config, self._backend.action_dim)
+        inputs = num_reward_inputs(self._backend.reward_term_names)
+        schema = dataset_schema(config, self._backend.action_dim, inputs)
         started = time.monotonic()
         with FrameDatasetWriter(folder, schema, dataset_hash(config)) as writer:
             already = writer.num_steps
@@ -107,16 +129,22 @@ class Pipeline:
                 self._stop.check()
             writer.finish()
             self._progress.end(f"{writer.num_steps} steps")
-        return folder
 
     def _pretrain(self, dataset: Path) -> Path | None:
         config = self._config
         if not config.encoder.uses_image or config.pretrain.steps == 0:
             return None
         folder = self._artifacts / f"encoder-{pretrain_hash(config)}"
-        if folder.exists():
-            self._progress.say(f"pretrain  the pre-trained encoder is there: {folder}")
-            return folder
+        if not folder.exists():
+            with sole_maker(folder, self._progress, self._stop):
+                if not folder.exists():
+                    self._make_encoder(dataset, folder)
+                    return folder
+        self._progress.say(f"pretrain  the pre-trained encoder is there: {folder}")
+        return folder
+
+    def _make_encoder(self, dataset: Path, folder: Path) -> None:
+        config = self._config
         total = config.pretrain.steps
         self._progress.begin("pretrain", f"{total} gradient steps: positions, visibility, attention")
         shown: dict[str, float] = {}
@@ -131,7 +159,6 @@ class Pipeline:
             if error is not None and baseline is not None
             else "done"
         )
-        return folder
 
     def _train(self, dataset: Path, pretrained: Path | None) -> None:
         config = self._config
@@ -283,7 +310,7 @@ class Pipeline:
     def _eta(self, report: TrainReport) -> dict[str, float]:
         """Time to the last step at the present rate; nothing while nobody collects."""
         rate = report.metrics.get("worker_env_steps_per_s", 0.0)
-        left = self._config.schedule.total_steps - report.env_steps
+        left = max(0, self._config.schedule.total_steps - report.env_steps)
         return {"run_eta_s": left / rate} if rate > 0 else {}
 
     def _time_s(self) -> float:

@@ -15,7 +15,7 @@ def paper() -> RunConfig:
 def steady() -> RunConfig:
     """The paper's lengths with what was measured to learn reliably: see `ops/results/learning.md`.
 
-    The reward is smooth up to the target, the discount short, and the temperature falls from exploring to standing still.
+    The reward is smooth up to the target, the discount short; the temperature falls from exploring to standing still.
     """
     base = paper()
     return replace(

@@ -36,6 +36,8 @@ class StepCheck:
             BrokenEnvironmentError: more than `MAX_REJECTED` of the last `WINDOW_STEPS` could not.
         """
         good = np.isfinite(step.reward) & np.isfinite(step.reward_terms).all(axis=1)
+        if step.reward_inputs is not None:
+            good &= np.isfinite(step.reward_inputs).all(axis=1)
         good &= _sound(step.final) & _sound(step.observation)
         self._count(good, "a step")
         return good

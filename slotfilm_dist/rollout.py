@@ -191,6 +191,7 @@ class _Lane:
                 "truncated": step.truncated[i],
                 "is_step": np.True_,
             }
+            | ({} if step.reward_inputs is None else {"reward_inputs": step.reward_inputs[i]})
         )
         self.open = True
 
@@ -205,6 +206,7 @@ class _Lane:
                 "truncated": np.False_,
                 "is_step": np.False_,
             }
+            | ({"reward_inputs": np.zeros_like(last["reward_inputs"])} if "reward_inputs" in last else {})
         )
         self.open = False
 

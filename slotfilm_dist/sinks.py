@@ -18,7 +18,7 @@ from prometheus_client import CollectorRegistry, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.registry import Collector
 
-from slotfilm_dist.metrics import AXES, PHASES, WAIT_BUCKETS_S, Metric, check_names, find_metric
+from slotfilm_dist.metrics import AXES, PHASES, WAIT_BUCKETS_S, Metric, check_names, find_metric, zero_counters
 
 _logger = logging.getLogger(__name__)
 
@@ -142,7 +142,7 @@ class TensorBoardSink:
 
 
 class PrometheusSink:
-    """Serves the latest values to Prometheus on this machine's loopback address.
+    """Serves the latest values to Prometheus on this machine's loopback address, with `from_zero` counters at once.
 
     A taken port does not stop a run: the next free one of 32 is used, and where there is none the values stay unserved
     and one warning says so. Each sink has a registry of its own, so that several fit into one process.
@@ -191,7 +191,7 @@ class _LatestValues(Collector):
     def __init__(self, labels: dict[str, str]) -> None:
         self._labels = labels
         self._lock = threading.Lock()
-        self._values: dict[str, float] = {}
+        self._values = zero_counters()
         self._buckets: dict[str, list[int]] = {}
         self._sums: dict[str, float] = {}
 
@@ -252,10 +252,15 @@ class FanOut:
         self._sinks = tuple(sinks)
         self.num_failures = [0] * len(self._sinks)
         """Writes that failed, by sink."""
+        self.num_nonfinite = 0
+        """Values that were not finite."""
 
     def write(self, values: Values) -> None:
         """Write to every sink; raises ``ValueError`` for an unknown metric name and nothing else."""
         check_names(values)
+        self.num_nonfinite += sum(not math.isfinite(value) for value in values.values())
+        if self.num_nonfinite:
+            values = {**values, "sink_nonfinite_total": self.num_nonfinite}
         if sum(self.num_failures):
             values = {**values, "sink_failures_total": sum(self.num_failures)}
         for index in range(len(self._sinks)):

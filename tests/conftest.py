@@ -2,7 +2,9 @@
 
 import os
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jaxtyping
 import pytest
@@ -42,3 +44,25 @@ def _one_thread() -> None:
     import torch
 
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def write_agent_run() -> Callable[..., Path]:
+    """Writes a run directory with a config and a checkpoint: of this agent, or of one that is new."""
+
+    def write_agent_run(folder: Path, config: Any, learner: Any = None) -> Path:
+        import torch
+
+        from slotfilm_dist.config import save_config
+        from slotfilm_dist.learning.checkpoint import CheckpointStore
+        from slotfilm_dist.learning.learner import Learner
+
+        if learner is None:
+            learner = Learner(config, 7, torch.device("cpu"))
+            learner.begin_rl(None)
+        folder.mkdir(parents=True)
+        save_config(config, folder / "config.json")
+        CheckpointStore(folder / "checkpoints", 1).write(learner.checkpoint({"limiter": {"env_steps": 12}}), 0)
+        return folder
+
+    return write_agent_run

@@ -120,7 +120,7 @@ WORKERS = [
         "Workers replaced",
         "short",
         {"{{run}} {{reason}}": total("worker_restarts_total", "by (run, reason)")},
-        "Empty until the first one.",
+        "Since this start of the run.",
     ),
     lines(
         "Time of one environment step",

@@ -17,6 +17,7 @@ import psutil
 
 from slotfilm_dist.chaos.live import MetricsTail, live_config
 from slotfilm_dist.chaos.outcome import Observation, UnexpectedError
+from slotfilm_dist.cluster.session import FOLDER_PREFIX, OWNER_FILE
 from slotfilm_dist.config import RunConfig, save_config
 from slotfilm_dist.learning.checkpoint import CheckpointStore
 from slotfilm_dist.learning.learner import learning_hash
@@ -84,12 +85,16 @@ class DriverProcess:
         return int(found[0].values["updates"]) if found else 0
 
     def close(self) -> None:
-        """End it and what it has left behind."""
+        """End it and what it has left behind; its cluster's watchdog comes first, for it also deletes files."""
+        family: list[psutil.Process] = []
         with contextlib.suppress(psutil.NoSuchProcess):
-            for process in self.family():
-                with contextlib.suppress(psutil.NoSuchProcess):
-                    process.kill()
+            family = self.family()
+        self._popen.kill()
         self._popen.wait()
+        _, orphans = psutil.wait_procs(family, ORPHANS_S)
+        for process in orphans:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.kill()
         self._log.close()
 
 
@@ -106,7 +111,6 @@ def training(folder: Path, config: RunConfig) -> Iterator[DriverProcess]:
 def preempted(folder: Path, rng: np.random.Generator) -> Observation:
     """SIGTERM, as before a spot machine is taken away."""
     config = live_config(int(rng.integers(1000)))
-    before = _clusters()
     with training(folder / "preempted", config) as driver:
         family = driver.family()
         ports = _ports(family)
@@ -117,7 +121,7 @@ def preempted(folder: Path, rng: np.random.Generator) -> Observation:
         ended_s = time.monotonic() - began
         _, alive = psutil.wait_procs(family, 2)
         leaked_ports = [port for port in ports if _listening(port)]
-        leaked = f"{len(alive)} processes, {len(leaked_ports)} ports, {len(_clusters() - before)} folders"
+        leaked = f"{len(alive)} processes, {len(leaked_ports)} ports, {len(_folders_of(driver))} folders"
     return Observation(
         observed=f"a last checkpoint, then an ordered shutdown; exit code {code}",
         figure=f"checkpoint after {committed_s:.1f} s (at most {COMMIT_S:g}); ended after {ended_s:.1f} s (at most "
@@ -138,7 +142,9 @@ def driver_killed(folder: Path, rng: np.random.Generator) -> Observation:
         family, saved = driver.family(), driver.last_updates()
         driver.process.kill()
         driver.code()
+        began = time.monotonic()
         _, orphans = psutil.wait_procs(family, ORPHANS_S)
+        ended_s, folders = time.monotonic() - began, len(_folders_of(driver))
         for process in orphans:
             process.kill()
     again = DriverProcess(path, config)
@@ -151,9 +157,9 @@ def driver_killed(folder: Path, rng: np.random.Generator) -> Observation:
         again.close()
     return Observation(
         observed="its processes ended with it; the resumed run went on from the last checkpoint",
-        figure=f"orphans after {ORPHANS_S:g} s: {len(orphans)}; checkpoint at {saved} updates, first report after the "
-        f"resume at {first:g}",
-        holds=not orphans and saved > 0,
+        figure=f"orphans after {ended_s:.1f} s: {len(orphans)}, folders: {folders}; checkpoint at "
+        f"{saved} updates, first report after the resume at {first:g}",
+        holds=not orphans and not folders and saved > 0,
     )
 
 
@@ -212,9 +218,10 @@ def port_taken(folder: Path, rng: np.random.Generator) -> Observation:
     )
 
 
-def _clusters() -> set[str]:
-    """Folders of private clusters on this machine."""
-    return {path.name for path in Path(tempfile.gettempdir()).glob("slotfilm-*")}
+def _folders_of(driver: DriverProcess) -> list[Path]:
+    """Folders of private clusters that a driver has started and that are there now."""
+    owners = Path(tempfile.gettempdir()).glob(f"{FOLDER_PREFIX}*/{OWNER_FILE}")
+    return [owner.parent for owner in owners if owner.read_text().startswith(f"{driver.process.pid} ")]
 
 
 def _until(holds: Callable[[], bool], timeout_s: float) -> float:

@@ -1,8 +1,10 @@
 """A worker's policy that keeps itself at the newest weights, in the middle of a block too. Plain, without Ray."""
 
+import logging
+import math
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -14,6 +16,10 @@ from slotfilm_dist.policy import Policy
 
 POLL_S = 1.0
 """Longest wait of one request for newer weights."""
+SLICE_S = 0.25
+"""A pause because of stale weights is cut in slices of this length, so that a stop is noticed."""
+
+_logger = logging.getLogger(__name__)
 
 
 @runtime_checkable
@@ -52,19 +58,32 @@ class ActingPolicy(Policy, Protocol):
 
 
 class WeightFollower:
-    """Loads published weights into a policy as they come, in a thread of its own; whoever acts is never paused.
+    """Loads published weights into a policy as they come, in a thread of its own; nobody waits for them but the first.
 
     Consumes snapshots, by long polls of the hub; produces nothing; waits for a newer version, and for an action under
     way to be chosen (some milliseconds). The newest wins, older versions are left alone. Ends within `POLL_S` of
     `close`, or when the hub is gone, which `raise_error` then says.
 
+    Weights are stale when nothing has been heard for too long: neither newer ones nor that there are none. While the
+    learner makes no updates, the hub goes on saying so, and weights of any age are fresh.
+
     Args:
         policy: gets the weights.
         link: where they come from.
+        max_staleness_s: time without an answer from which on the weights are stale.
+        clock: seconds that only grow.
     """
 
-    def __init__(self, policy: LoadablePolicy, link: WeightLink) -> None:
+    def __init__(
+        self,
+        policy: LoadablePolicy,
+        link: WeightLink,
+        max_staleness_s: float = math.inf,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._policy, self._link = policy, link
+        self.max_staleness_s, self._clock = max_staleness_s, clock
+        self._heard_at = clock()
         self._changed = threading.Condition()
         self._closing = threading.Event()
         self._lags_s: list[float] = []
@@ -81,6 +100,21 @@ class WeightFollower:
             self._changed.wait_for(lambda: self.version >= 0 or self._error is not None, timeout_s)
         self.raise_error()
         return self.version >= 0
+
+    @property
+    def silence_s(self) -> float:
+        """Time since the last answer to the question for newer weights."""
+        return self._clock() - self._heard_at
+
+    def await_fresh(self, timeout_s: float) -> bool:
+        """Whether the weights are not stale; waits for an answer if they are; raises what ended the thread."""
+        if self.silence_s > self.max_staleness_s:
+            with self._changed:
+                self._changed.wait_for(
+                    lambda: self.silence_s <= self.max_staleness_s or self._error is not None, timeout_s
+                )
+        self.raise_error()
+        return self.silence_s <= self.max_staleness_s
 
     def raise_error(self) -> None:
         """Raise what ended the thread, if anything did."""
@@ -117,6 +151,9 @@ class WeightFollower:
                 snapshot = self._link.await_newer(self.version, POLL_S)
                 if snapshot is not None and not self._closing.is_set():
                     self.take(snapshot)
+                with self._changed:
+                    self._heard_at = self._clock()
+                    self._changed.notify_all()
             except RoleSilentError:
                 continue  # the weights at hand go on acting
             except Exception as error:  # raised again where the policy acts
@@ -132,11 +169,15 @@ class FollowingPolicy:
     Args:
         policy: acts.
         link: where its weights come from.
+        note: called with what is waited for while the weights are stale, a few times a second; may raise to end that.
+        max_staleness_s: see `WeightFollower`.
     """
 
-    def __init__(self, policy: LoadablePolicy, link: WeightLink) -> None:
-        self._policy = policy
-        self._follower = WeightFollower(policy, link)
+    def __init__(
+        self, policy: LoadablePolicy, link: WeightLink, note: Callable[[str], None], max_staleness_s: float = math.inf
+    ) -> None:
+        self._policy, self._note = policy, note
+        self._follower = WeightFollower(policy, link, max_staleness_s)
         self.backbone_hash = policy.backbone_hash
 
     @property
@@ -159,11 +200,26 @@ class FollowingPolicy:
     def act(
         self, observation: Observation, visual: Shaped[np.ndarray, "envs *visual"]
     ) -> Float32[np.ndarray, "envs action"]:
-        """Actions of the newest weights."""
-        self._follower.raise_error()
+        """Actions of the newest weights; pauses while they are stale."""
+        self._pause_while_stale()
         with self._follower.steady:
             return self._policy.act(observation, visual)
 
     def close(self) -> None:
         """Follow no weights any more."""
         self._follower.close()
+
+    def _pause_while_stale(self) -> None:
+        follower, began = self._follower, time.monotonic()
+        paused = False
+        while not follower.await_fresh(SLICE_S if paused else 0.0):
+            waiting_for = (
+                f"the hub: no word for {follower.silence_s:.0f} s whether version {follower.version} is the newest, at "
+                f"most runtime.max_staleness_s = {follower.max_staleness_s:g}"
+            )
+            if not paused:
+                _logger.warning("waiting for %s", waiting_for)
+            paused = True
+            self._note(waiting_for)
+        if paused:
+            _logger.warning("the hub answers again; the pause took %.1f s", time.monotonic() - began)

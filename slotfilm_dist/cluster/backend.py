@@ -14,7 +14,7 @@ from slotfilm_dist.cluster.hub_client import HubClient
 from slotfilm_dist.cluster.inference_client import InferenceClient
 from slotfilm_dist.cluster.learner_keeper import LONG_S, STOP_S, LearnerKeeper
 from slotfilm_dist.cluster.messages import AgentSetup, LearnerStatus
-from slotfilm_dist.cluster.placement import STATE_RESOURCE, plan
+from slotfilm_dist.cluster.placement import STATE_RESOURCE, Placement, plan
 from slotfilm_dist.cluster.replay_client import ReplayClient, ShardClient
 from slotfilm_dist.cluster.reporting import Reporter
 from slotfilm_dist.cluster.session import Session, namespace_of, read_cluster_file
@@ -51,6 +51,7 @@ class RayBackend:
         limits: how long workers may go without progress; None for the defaults.
         snapshot_s: seconds between snapshots of replay.
         wiring: what lies between the learner and its links.
+        placement: what the roles ask for, for a run that has its share of the cluster; None plans for all of it.
     """
 
     def __init__(
@@ -61,9 +62,11 @@ class RayBackend:
         limits: Any = None,
         snapshot_s: float = SNAPSHOT_S,
         wiring: Wiring | None = None,
+        placement: Placement | None = None,
     ) -> None:
         self._config, self._run, self._make_env = config, run.resolve(), make_env
         self._limits, self._snapshot_s, self._wiring = limits, snapshot_s, wiring or Wiring()
+        self._given_placement = placement
         self._session: Session | None = None
         self._learner: LearnerKeeper | None = None
         self._hub: HubClient | None = None
@@ -87,7 +90,8 @@ class RayBackend:
         config, session = self._config, Session(metrics_port=self._config.runtime.metrics_port)
         self._session = session
         kept = session.place(STATE_RESOURCE)
-        self._placement = dataclasses.replace(plan(config, session.nodes()), state_resources=kept)
+        placement = self._given_placement or plan(config, session.nodes())
+        self._placement = dataclasses.replace(placement, state_resources=kept)
         self._starts = int(read_cluster_file(self._run).get("starts", 0)) + 1
         self._hub = HubClient.launch(config, namespace_of(self._run), kept)
         self._workforce = Workforce(

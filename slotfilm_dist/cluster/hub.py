@@ -1,5 +1,6 @@
 """The one place where steps and updates are counted, and where the newest weights lie."""
 
+import random
 import threading
 import time
 from collections.abc import Iterable
@@ -14,6 +15,12 @@ SLACK_STEPS = 64
 CHUNK_STEPS = 8
 """Updates for so many steps are granted at once."""
 MAX_CHUNK_UPDATES = 16
+WAITING_ROOM = 48
+"""Workers that wait in the hub at once, each on a thread; fewer than there are, so that no call queues for one."""
+ASKS_PER_S = 200.0
+"""Workers beyond those are told to ask again later, together about so often."""
+LEAST_RETRY_S = 0.1
+"""Shortest mean time until they ask again."""
 
 
 def chunk_updates(updates_per_step: float) -> int:
@@ -37,14 +44,28 @@ class Hub:
     A worker's steps count from the grant on, and for good once the worker has said that they are stored. What a lost
     worker had been granted and not stored is taken back (`settle`), so the ratio stays exact whoever dies.
 
+    So that hundreds of workers may wait, only some of them wait here. The others are answered at once and ask again
+    after a while: at a random time, and the later the more workers there are. The learner never lacks steps for it,
+    because whoever is told so has all those that wait here before it.
+
     Args:
         limiter: of the run.
         total_steps: no more are admitted once so many are.
         num_workers: wanted at first.
         auto_workers: the run changes that number by itself.
+        waiting_room: workers that wait here at once.
     """
 
-    def __init__(self, limiter: RateLimiter, total_steps: int, num_workers: int, *, auto_workers: bool = False) -> None:
+    def __init__(
+        self,
+        limiter: RateLimiter,
+        total_steps: int,
+        num_workers: int,
+        *,
+        auto_workers: bool = False,
+        waiting_room: int = WAITING_ROOM,
+    ) -> None:
+        self._places = threading.Semaphore(waiting_room)
         self._limiter = limiter
         self._total_steps = total_steps
         self._lock = threading.Lock()
@@ -64,6 +85,8 @@ class Hub:
     def admit_steps(self, notice: BlockNotice, stored: Iterable[BlockKey], timeout_s: float) -> StepGrant:
         """Wait until a block's steps fit; asked again for the same block, they are not counted again.
 
+        Where too many wait already, the answer comes at once and says when to ask again.
+
         Args:
             notice: the block that is to be stored.
             stored: earlier blocks of the same worker that are in replay by now.
@@ -74,9 +97,15 @@ class Hub:
             version = notice.policy_version
             self._acting[notice.key.worker_id] = (version, self._published.get(version, time.time()))
             known = notice.key in self._pending
-        waited_s, waiting_for, granted = 0.0, "", known
+        waited_s, waiting_for, granted, retry_s = 0.0, "", known, 0.0
         if not known and not self.finished:
-            admission = self._limiter.await_insert(notice.num_steps, timeout_s)
+            waits = self._places.acquire(blocking=False)
+            try:
+                admission = self._limiter.await_insert(notice.num_steps, timeout_s if waits else 0.0)
+            finally:
+                if waits:
+                    self._places.release()
+            retry_s = 0.0 if waits or admission.granted else self._retry_s()
             waited_s, waiting_for, granted = admission.waited_s, admission.waiting_for, admission.granted
             if granted:
                 granted = self._note_granted(notice)
@@ -85,7 +114,13 @@ class Hub:
             waited_s=waited_s,
             waiting_for=waiting_for,
             finished=not granted and self.finished,
+            retry_s=retry_s,
         )
+
+    def _retry_s(self) -> float:
+        """A time that spreads the questions of all workers that act."""
+        mean_s = max(LEAST_RETRY_S, len(self._acting) / ASKS_PER_S)
+        return mean_s * random.uniform(0.5, 1.5)
 
     def _note_granted(self, notice: BlockNotice) -> bool:
         """Remember a grant; a worker that was lost, or too late, while it waited gets none."""

@@ -1,5 +1,6 @@
 """Central inference: one encoder and actor, on a GPU where there is one, act for many workers. Plain, without Ray."""
 
+import math
 import threading
 import time
 import uuid
@@ -48,6 +49,7 @@ class InferenceServer:
         weights: where its weights come from.
         deadline_s: longest wait of a request for others.
         max_batch: observations computed at once.
+        max_staleness_s: see `WeightFollower`.
     """
 
     def __init__(
@@ -57,11 +59,12 @@ class InferenceServer:
         *,
         deadline_s: float = DEADLINE_S,
         max_batch: int = MAX_BATCH_STEPS,
+        max_staleness_s: float = math.inf,
     ) -> None:
         self._policy = policy
         self._device = next(policy.actor.parameters()).device
         self._deadline_s, self._max_batch = deadline_s, max_batch
-        self._follower = WeightFollower(policy, weights)
+        self._follower = WeightFollower(policy, weights, max_staleness_s)
         self._changed = threading.Condition()
         self._pending: deque[_Pending] = deque()
         self._active: dict[int, float] = {}
@@ -75,10 +78,12 @@ class InferenceServer:
         """Tokens of the pictures and actions of the newest weights.
 
         Raises:
-            RoleSilentError: the learner has published no weights, or no batch was computed, in time.
+            RoleSilentError: the learner has published no weights, they are stale, or no batch was computed, in time.
         """
         if not self._follower.await_first(ANSWER_S):
             raise RoleSilentError("learner", "its first weights", ANSWER_S)
+        if not self._follower.await_fresh(ANSWER_S):
+            raise RoleSilentError("hub", "whether there are newer weights", self._follower.silence_s)
         pending = _Pending(request=request, arrived_at=time.monotonic())
         with self._changed:
             self._active[request.worker_id] = pending.arrived_at

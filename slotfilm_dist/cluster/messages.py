@@ -43,6 +43,8 @@ class StepGrant:
     """What was still missing when time ran out; empty if granted."""
     finished: bool
     """The run has all its steps: stop collecting."""
+    retry_s: float = 0.0
+    """Time to let pass before asking again, because too many wait; 0 to ask, and wait, at once."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

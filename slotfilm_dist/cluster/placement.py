@@ -69,7 +69,7 @@ def plan(config: RunConfig, nodes: Sequence[Mapping[str, float]]) -> Placement:
         (nodes_for(nodes, STATE_RESOURCE), 1 + central),
     )
     for share in SHARES:
-        if all(sum(math.floor(n.get("CPU", 0.0) / share + 1e-9) for n in on) >= num for on, num in needs):
+        if all(num_roles_that_fit(on, share) >= num for on, num in needs):
             return Placement(
                 share_cpus=share,
                 gpu=gpu,
@@ -84,14 +84,19 @@ def plan(config: RunConfig, nodes: Sequence[Mapping[str, float]]) -> Placement:
     )
 
 
+def num_roles_that_fit(nodes: Sequence[Mapping[str, float]], share: float) -> int:
+    """Roles that find so many cores each; a role's cores lie on one node."""
+    return sum(math.floor(node.get("CPU", 0.0) / share + 1e-9) for node in nodes)
+
+
 def nodes_for(nodes: Sequence[Mapping[str, float]], resource: str) -> Sequence[Mapping[str, float]]:
     """The nodes that offer a resource; all of them where none does."""
     return [node for node in nodes if resource in node] or nodes
 
 
-def place(nodes: Sequence[Mapping[str, float]], resource: str) -> dict[str, float]:
-    """What to ask for to be put onto a node that offers a resource; nothing where none does."""
-    return {resource: TOKEN} if any(resource in node for node in nodes) else {}
+def place(places: Sequence[Mapping[str, float]], resource: str) -> dict[str, float]:
+    """What to ask for to be put where a resource is offered; nothing where none of these nodes or bundles does."""
+    return {resource: TOKEN} if any(resource in offered for offered in places) else {}
 
 
 def infers_centrally(config: RunConfig, *, gpu: bool) -> bool:

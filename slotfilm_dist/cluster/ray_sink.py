@@ -6,7 +6,7 @@ from typing import Any
 
 from ray.util.metrics import Gauge, Histogram
 
-from slotfilm_dist.metrics import RAY_PREFIX, WAIT_BUCKETS_S, Metric, check_names, find_metric
+from slotfilm_dist.metrics import RAY_PREFIX, WAIT_BUCKETS_S, Metric, check_names, find_metric, zero_counters
 from slotfilm_dist.sinks import Values
 
 
@@ -27,11 +27,16 @@ class RaySink:
         self._labels = dict(labels)
         self._worker = worker
         self._instruments: dict[str, Any] = {}
+        self._not_happened = {} if worker else zero_counters()
 
     def write(self, values: Values) -> None:
-        """Show these values from Ray's next report on; raises ``ValueError`` for an unknown metric name."""
+        """Show these values from Ray's next report on; raises ``ValueError`` for an unknown metric name.
+
+        The driver also shows the `from_zero` counters that have not been written yet, at zero.
+        """
         check_names(values)
-        for key, value in values.items():
+        self._not_happened = {key: zero for key, zero in self._not_happened.items() if key not in values}
+        for key, value in (self._not_happened | dict(values)).items():
             metric, label = find_metric(key)
             if metric.by_worker == bool(self._worker):
                 self._write(metric, label, float(value))

@@ -123,6 +123,8 @@ class BlockSender:
             if grant.granted:
                 return True
             self._waiting_for = f"the limiter: {grant.waiting_for}"
+            if grant.retry_s:
+                self._closing.wait(grant.retry_s)
         return False
 
     def _deliver(self, block: TransitionBlock) -> None:

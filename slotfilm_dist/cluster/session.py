@@ -21,6 +21,7 @@ from ray._private import ray_constants
 from slotfilm_dist.atomic import write_atomic
 from slotfilm_dist.backend import RunFailedError
 from slotfilm_dist.cluster.placement import place
+from slotfilm_dist.cluster.watchdog import MARK, Watchdog
 from slotfilm_dist.machine import usable_cores, usable_memory_bytes
 
 STORE_BYTES = 1 << 30
@@ -40,7 +41,8 @@ class Session:
     With `RAY_ADDRESS` set, as inside a Ray job, or where Ray is connected already, as inside a Tune trial, that cluster
     is used and left running. Otherwise a private one is started, without a dashboard or usage reports, with a token of
     its own (unless `RAY_AUTH_MODE` says otherwise) in a folder that nobody else can read. It listens on the loopback
-    only, so that nobody reaches it from another machine, and the token keeps this machine's other users out.
+    only, so that nobody reaches it from another machine, and the token keeps this machine's other users out. A
+    `Watchdog` ends it and deletes its files even if this process is killed.
 
     Args:
         num_cpus: cores of a private cluster; 0 takes all that may be used.
@@ -52,6 +54,7 @@ class Session:
         self.private = False
         self._joined = False
         self._folder: Path | None = None
+        self._watchdog: Watchdog | None = None
         self._environment: dict[str, str | None] = {}
         self._loopback = contextlib.ExitStack()
         if ray.is_initialized():
@@ -85,9 +88,10 @@ class Session:
     def place(self, resource: str) -> dict[str, float]:
         """What a role asks for to be put onto a live node that offers a resource; nothing where none does.
 
-        Nor in a placement group, such as a Tune trial's, which offers nothing but its bundles.
+        In a placement group, such as a Tune trial's, the bundles stand for the nodes.
         """
-        return {} if ray.util.get_current_placement_group() is not None else place(self.nodes(), resource)
+        group = ray.util.get_current_placement_group()
+        return place(self.nodes() if group is None else group.bundle_specs, resource)
 
     def available_cpus(self) -> float:
         """Cores that nobody has asked for."""
@@ -116,6 +120,8 @@ class Session:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+        if self._watchdog is not None:
+            self._watchdog.close()
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
 
@@ -125,6 +131,8 @@ class Session:
         remove_stale_folders(Path(tempfile.gettempdir()))
         self._folder = Path(tempfile.mkdtemp(prefix=FOLDER_PREFIX))
         (self._folder / OWNER_FILE).write_text(_process_name(os.getpid()))
+        self._watchdog = Watchdog(self._folder)
+        self._set(MARK, str(self._folder))
         self._set("RAY_USAGE_STATS_ENABLED", "0")
         self._set(ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR, "0")
         self._loopback.enter_context(_on_loopback())

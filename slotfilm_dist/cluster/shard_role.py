@@ -51,8 +51,8 @@ def build_shard(config: RunConfig, schema: ReplaySchema, index: int) -> FencedSh
 class ShardRole:
     """A `FencedShard` behind a lock, with snapshots. Thread-safe.
 
-    Consumes blocks and requests for batches; waits for nothing; ends with its process. Snapshots are copied under the
-    lock (as fast as memory) and written outside of it, so sampling goes on meanwhile.
+    Consumes blocks and requests for batches; waits for nothing; ends with its process. A snapshot is of one instant,
+    but the lock is held only for 8 MB of it at a time, so sampling and inserting go on meanwhile; see `FrozenRows`.
 
     Args:
         shard: empty.
@@ -118,12 +118,15 @@ class ShardRole:
         """Write a snapshot; gives the steps in it. One at a time."""
         with self._writing:
             with self._lock:
-                state, num_steps = self._shard.save(), self._shard.num_steps()
+                state, num_steps = self._shard.freeze(self._lock), self._shard.num_steps()
             try:
                 write_snapshot(self._folder, state)
             except OSError as error:
                 self._snapshot_error = str(error)
                 raise
+            finally:
+                with self._lock:
+                    self._shard.thaw()
             self._snapshot_error = ""
             return num_steps
 

@@ -129,10 +129,11 @@ class WorkerLoop:
         """
         sender = self._sender = BlockSender(hub, store)
         seed = self._seed(Role.ACTIONS, incarnation)
+        max_staleness_s = self._config.runtime.max_staleness_s
 
         def policy(action_dim: int) -> Policy:
             acting = self._acting = (
-                FollowingPolicy(build_policy(self._config, agent, seed), hub)
+                FollowingPolicy(build_policy(self._config, agent, seed), hub, self._note_wait, max_staleness_s)
                 if isinstance(agent, AgentSetup)
                 else CentralPolicy(agent, self._worker_id, action_dim, seed, self._note_wait)
             )

@@ -24,7 +24,7 @@ from transforms3d.euler import euler2quat
 from slotfilm_dist.config import EnvConfig, RewardConfig, SuccessConfig
 from slotfilm_dist.envs.meshes import object_files
 from slotfilm_dist.envs.panda import SlotfilmPanda
-from slotfilm_dist.envs.reward import Progress, RewardTerms, max_reward, progress, reward_terms
+from slotfilm_dist.envs.reward import Progress, RewardTerms, max_reward, progress, reward_inputs, reward_terms
 from slotfilm_dist.envs.scene import SceneReader, SceneState
 
 CONTROL_HZ = 20
@@ -193,16 +193,18 @@ class PickBananaEnv(BaseEnv):
         return self._state
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Success, placed, grasped, contact and the reward's components at this instant."""
+        """Success, placed, grasped, contact, the reward's components and its inputs at this instant."""
         scene = self.scene_state()
         now = progress(scene, self.reward_config, self.success_config)
-        self._terms: RewardTerms = reward_terms(scene, now, self.reward_config)
+        inputs = reward_inputs(scene, now)
+        self._terms: RewardTerms = reward_terms(inputs, self.reward_config)
         return {
             "success": now.success,
             "is_placed": now.placed,
             "is_static": now.static,
             "is_grasped": scene.grasped,
             "contact": scene.contact,
+            "reward_inputs": inputs.packed(),
             **self._term_info(now),
         }
 

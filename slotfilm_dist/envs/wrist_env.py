@@ -16,13 +16,13 @@ from torch import Tensor
 import slotfilm_dist.envs.pick_banana  # noqa: F401  registers PickBanana-v1
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.envs.projection import project
+from slotfilm_dist.envs.reward import TERMS
 from slotfilm_dist.envs.scene import SceneReader, SceneState
 from slotfilm_dist.envs.tasks import task_named
 from slotfilm_dist.messages import Observation, StepResult
 
-NEAR_SCALE_M = 0.02
-"""Distance over which `object_to_goal_near` tells positions apart: about the radius of the target."""
-OWN_TERMS = ("reach", "grasp", "place", "post_grasp", "static")
+NEAR_SCALE_M = 0.05
+"""Distance over which `object_to_goal_near` tells positions apart: twice the radius of the target."""
 
 
 class WristEnv:
@@ -69,7 +69,7 @@ class WristEnv:
         except RuntimeError as error:
             raise ValueError(_cannot_build(config, str(error), camera=camera)) from error
         self.action_dim = int(self._env.single_action_space.shape[0])
-        self.reward_term_names: tuple[str, ...] = OWN_TERMS if own else ("reward",)
+        self.reward_term_names: tuple[str, ...] = TERMS if own else ("reward",)
         self._make_camera = (lambda: WristCamera(self._env, config.env)) if camera else (lambda: None)
         self._attach()
         self._elapsed = np.zeros(num_envs, np.int64)
@@ -127,6 +127,7 @@ class WristEnv:
             "grasped": _array(scene.grasped, bool),
             "contact": _array(scene.contact, bool),
             "reward_terms": self._terms(reward, info),
+            "reward_inputs": _array(info["reward_inputs"], np.float32) if self._task.own_reward else None,
         }
         over = ended | truncated
         observation = self._restart(over, next_seeds) if over.any() else final
@@ -145,7 +146,7 @@ class WristEnv:
     def _terms(self, reward: Tensor, info: dict[str, Tensor]) -> Float32[np.ndarray, "envs terms"]:
         if not self._task.own_reward:
             return _array(reward, np.float32)[:, None]
-        return _array(torch.stack([info[f"reward_{name}"] for name in OWN_TERMS], dim=-1), np.float32)
+        return _array(torch.stack([info[f"reward_{name}"] for name in TERMS], dim=-1), np.float32)
 
     def _restart(self, over: np.ndarray, next_seeds: Sequence[int]) -> Observation:
         indices = np.flatnonzero(over)

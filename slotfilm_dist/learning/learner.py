@@ -17,12 +17,14 @@ Who drives it, in one process or through an actor:
 import dataclasses
 import time
 from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 
 from slotfilm_dist.config import TEMPERATURE_FIELDS, RunConfig, SacConfig, config_hash
+from slotfilm_dist.envs.reward import rewards_of
 from slotfilm_dist.learning.checkpoint import Checkpoint, plain_tensors
 from slotfilm_dist.learning.ddpg import DdpgLearner
 from slotfilm_dist.learning.frames import PretrainFrames
@@ -194,9 +196,9 @@ class Learner:
         return replay_schema(self.config, self.encoder, self._action_dim)
 
     def stored_blocks(self, dataset: FrameDataset) -> Iterator[TransitionBlock]:
-        """The random policy's data as replay keeps it: pictures become tokens once, here."""
+        """The random policy's data as replay keeps it: pictures become tokens once, here, and get this run's reward."""
         backbone_hash = self.schema().backbone_hash
-        for block in dataset.blocks(ENCODE_ROWS):
+        for block in dataset.blocks(ENCODE_ROWS, partial(rewards_of, config=self.config.reward)):
             yield dataclasses.replace(block, visual=self._stored_visual(block.visual), backbone_hash=backbone_hash)
 
     @torch.inference_mode()
@@ -265,8 +267,8 @@ def replay_schema(config: RunConfig, encoder: Encoder, action_dim: int) -> Repla
     )
 
 
-def dataset_schema(config: RunConfig, action_dim: int) -> ReplaySchema:
-    """How the random policy's data are stored: pictures with labels, or no camera at all."""
+def dataset_schema(config: RunConfig, action_dim: int, num_reward_inputs: int = 0) -> ReplaySchema:
+    """How the random policy's data are stored: pictures with labels or none, the reward or what it follows from."""
     size = config.env.image_size
     image = config.encoder.uses_image
     return ReplaySchema(
@@ -276,10 +278,14 @@ def dataset_schema(config: RunConfig, action_dim: int) -> ReplaySchema:
         action_dim=action_dim,
         num_objects=config.obs.num_objects,
         store_labels=True,
+        num_reward_inputs=num_reward_inputs,
     )
 
 
 def dataset_hash(config: RunConfig) -> str:
-    """Names the random policy's data: the fields that it depends on, and no others."""
-    identity = data_identity(config) | {"camera": config.encoder.uses_image}
-    return config_hash(config.env, config.obs.state_fields, config.reward, config.success, identity)
+    """Names the random policy's data: the fields that it depends on, and no others.
+
+    Of `reward` that is only the target's radius, which can be seen and decides success; success can end an episode.
+    """
+    identity = data_identity(config) | {"camera": config.encoder.uses_image, "delta_m": config.reward.delta_m}
+    return config_hash(config.env, config.obs.state_fields, config.success, identity)

@@ -1,7 +1,7 @@
 """The random policy's frames as a directory of columns, read through memory maps and shared by many trials."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from slotfilm_dist.replay.schema import Column, ReplaySchema
 
 MANIFEST = "manifest.json"
 PROGRESS = "progress.json"
-FORMAT = 1
+FORMAT = 2
 """Version of the layout on disk."""
 HEADER_BYTES = 256
 """Size of a column's `.npy` header."""
@@ -27,9 +27,14 @@ EPISODE_COLUMN = Column(shape=(), dtype=np.dtype(np.int32))
 DATASET_WORKER_ID = -1
 """Worker id of blocks that were read from a dataset, which no worker has."""
 
+RewardOf = Callable[[Float32[np.ndarray, "rows inputs"]], Float32[np.ndarray, " rows"]]
+"""Computes a run's own reward from the reward's inputs."""
+
 
 def dataset_columns(schema: ReplaySchema) -> dict[str, Column]:
     """The files of a dataset, by name without `.npy`: the schema's columns, the picture's called `rgb`, and `episode`.
+
+    Where the reward's inputs are stored the reward is not: it is another one for every config that shares the dataset.
 
     Raises:
         ValueError: the schema stores tokens, which would tie the frames to one backbone, or no labels.
@@ -37,6 +42,8 @@ def dataset_columns(schema: ReplaySchema) -> dict[str, Column]:
     check(schema.visual_kind != "tokens", "schema.visual_kind", schema.visual_kind, "a dataset keeps pictures")
     check(schema.store_labels, "schema.store_labels", False, "a dataset is for pre-training, which needs the labels")
     columns = {("rgb" if name == "visual" else name): column for name, column in schema.columns.items()}
+    if schema.num_reward_inputs:
+        del columns["reward"]
     return columns | {"episode": EPISODE_COLUMN}
 
 
@@ -62,35 +69,47 @@ class FrameDataset:
     uv: Float32[np.ndarray, "rows objects 2"]
     visible: Bool[np.ndarray, "rows objects"]
     action: Float32[np.ndarray, "rows action"]
-    reward: Float32[np.ndarray, " rows"]
     terminated: Bool[np.ndarray, " rows"]
     truncated: Bool[np.ndarray, " rows"]
     is_step: Bool[np.ndarray, " rows"]
     episode: Int32[np.ndarray, " rows"]
     """Episode of the row, from 0; rows of one episode may lie apart. Split train from test by it, not by rows."""
+    reward: Float32[np.ndarray, " rows"] | None = None
+    """Unscaled reward, where the environment brings its own; None where `reward_inputs` are stored instead."""
+    reward_inputs: Float32[np.ndarray, "rows inputs"] | None = None
+    """What each run computes its own reward from; zeros in rows without a step."""
 
     @property
     def num_rows(self) -> int:
         """Frames held; a frame between two blocks is held twice."""
-        return len(self.reward)
+        return len(self.is_step)
 
-    def blocks(self, rows: int) -> Iterator[TransitionBlock]:
+    def blocks(self, rows: int, reward_of: RewardOf | None = None) -> Iterator[TransitionBlock]:
         """Everything in order, in blocks of at most `rows` rows where the layout allows, for filling replay.
 
         Blocks end where a row holds no step, so a longer run of steps gives a longer block. Their arrays are views of
         the files. Replace `visual` and `backbone_hash` with a backbone's tokens where replay holds those.
+
+        Args:
+            rows: most rows of a block.
+            reward_of: the run's reward; needed where the dataset holds `reward_inputs`, unused elsewhere.
+
+        Raises:
+            ValueError: no `reward_of` where one is needed.
         """
         check(rows > 0, "rows", rows, "must be greater than 0")
+        if self.reward is None and reward_of is None:
+            raise ValueError("reward_of: this dataset holds the reward's inputs; say how the reward follows from them")
         ends = np.flatnonzero(~self.is_step) + 1
         start = sequence = 0
         while start < self.num_rows:
             reachable = int(np.searchsorted(ends, start + rows, side="right"))
             first = int(np.searchsorted(ends, start, side="right"))
             end = int(ends[max(reachable - 1, first)])
-            yield self._block(slice(start, end), sequence)
+            yield self._block(slice(start, end), sequence, reward_of)
             start, sequence = end, sequence + 1
 
-    def _block(self, span: slice, sequence: int) -> TransitionBlock:
+    def _block(self, span: slice, sequence: int, reward_of: RewardOf | None) -> TransitionBlock:
         return TransitionBlock(
             worker_id=DATASET_WORKER_ID,
             incarnation=0,
@@ -103,11 +122,18 @@ class FrameDataset:
             uv=self.uv[span],
             visible=self.visible[span],
             action=self.action[span],
-            reward=self.reward[span],
+            reward=self._rewards(span, reward_of),
             terminated=self.terminated[span],
             truncated=self.truncated[span],
             is_step=self.is_step[span],
         )
+
+    def _rewards(self, span: slice, reward_of: RewardOf | None) -> Float32[np.ndarray, " rows"]:
+        if self.reward is not None:
+            return self.reward[span]
+        assert self.reward_inputs is not None, "a dataset holds one of the two"
+        assert reward_of is not None, "asked for before the first block"
+        return np.where(self.is_step[span], reward_of(self.reward_inputs[span]), np.float32(0))
 
 
 def open_dataset(directory: Path, expect_hash: str, *, verify: bool = True) -> FrameDataset:

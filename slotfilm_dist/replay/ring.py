@@ -1,6 +1,7 @@
 """Preallocated storage of rows: inserts overwrite the oldest steps, draws are uniform over the stored ones."""
 
 import math
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -10,6 +11,7 @@ from jaxtyping import Float32, Int64
 
 from slotfilm_dist.config import check
 from slotfilm_dist.messages import SampleBatch, TransitionBlock
+from slotfilm_dist.replay.frozen import FrozenRows
 from slotfilm_dist.replay.schema import ReplaySchema
 
 STEPS_PER_EPISODE_END = 200
@@ -61,6 +63,7 @@ class RowRing:
         self._next_row = 0
         self._first_step = 0
         self._next_step = 0
+        self._frozen: FrozenRows | None = None
         self.drawn = SampleTotals()
 
     @property
@@ -81,6 +84,8 @@ class RowRing:
         self._forget(oldest_row=self._next_row + num_rows - self.num_rows, num_new_steps=len(new_steps))
         start = self._next_row % self.num_rows
         head = min(num_rows, self.num_rows - start)
+        if self._frozen is not None:
+            self._frozen.keep(self._next_row, num_rows)
         for name, column in self._columns.items():
             value = getattr(block, name)[skipped:]
             column[start : start + head] = value[:head]
@@ -187,6 +192,24 @@ class RowRing:
         for array in (state["step_rows"], state["step_versions"], *state["columns"].values()):
             array.flags.writeable = False
         return state
+
+    def freeze(self, lock: threading.Lock) -> dict[str, Any]:
+        """The state of `view`, but it holds until `thaw` whatever is inserted; `lock` is held here and by each insert.
+
+        Its columns are `FrozenColumn`s, read in pieces without the lock; only what is small is copied here.
+        """
+        assert self._frozen is None, "thaw comes first"
+        state = self.view()
+        self._frozen = FrozenRows(self._columns, self._next_row, lock)
+        return state | {
+            "step_rows": state["step_rows"].copy(),
+            "step_versions": state["step_versions"].copy(),
+            "columns": self._frozen.columns,
+        }
+
+    def thaw(self) -> None:
+        """Nobody reads the frozen state any more."""
+        self._frozen = None
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Take over a saved state, copying its arrays; raises ``ValueError`` if it is of another size or schema."""

@@ -55,6 +55,8 @@ class ReplaySchema:
     """Keep the objects' image positions and visibility; sampling never returns them."""
     backbone_hash: str = ""
     """Hash of the backbone whose tokens are stored; empty for other kinds."""
+    num_reward_inputs: int = 0
+    """Numbers stored with a step from which the reward of any config follows; 0 stores the reward alone."""
 
     def __post_init__(self) -> None:
         kind, shape = self.visual_kind, self.visual_shape
@@ -67,6 +69,7 @@ class ReplaySchema:
         check(kind != "rgb" or shape[-1] == 3, "schema.visual_shape", shape, "pictures have 3 channels, last axis")
         for name in ("proprio_dim", "action_dim", "num_objects"):
             check(getattr(self, name) > 0, f"schema.{name}", getattr(self, name), "must be greater than 0")
+        check(self.num_reward_inputs >= 0, "schema.num_reward_inputs", self.num_reward_inputs, "must be 0 or more")
         check(
             (kind == "tokens") == bool(self.backbone_hash),
             "schema.backbone_hash",
@@ -91,6 +94,8 @@ class ReplaySchema:
         if self.store_labels:
             columns["uv"] = Column(shape=(self.num_objects, 2), dtype=float32)
             columns["visible"] = Column(shape=(self.num_objects,), dtype=flag)
+        if self.num_reward_inputs:
+            columns["reward_inputs"] = Column(shape=(self.num_reward_inputs,), dtype=float32)
         return columns
 
     @property
@@ -114,8 +119,10 @@ class ReplaySchema:
         if block.num_rows < 2:
             raise _refusal(block, "reward", f"{block.num_rows} rows; a step and its next frame are the least")
         for name, column in self.columns.items():
-            value: np.ndarray = getattr(block, name)
+            value: np.ndarray | None = getattr(block, name)
             expected = (block.num_rows, *column.shape)
+            if value is None:
+                raise _refusal(block, name, f"missing, expected {expected}; the environment gave none")
             if value.shape != expected:
                 raise _refusal(block, name, f"shape {value.shape}, expected {expected}")
             if value.dtype != column.dtype and value.size:
@@ -124,7 +131,7 @@ class ReplaySchema:
         _validate_layout(block)
 
     def _validate_values(self, block: TransitionBlock) -> None:
-        for name in ("reward", "proprio", "goal", "action"):
+        for name in ("reward", "proprio", "goal", "action", *(["reward_inputs"] if self.num_reward_inputs else [])):
             _require(block, name, np.isfinite(getattr(block, name)), "not finite")
         if self.visual_kind == "tokens":
             # All ones in the exponent's five bits; np.isfinite is 50 times slower on float16.

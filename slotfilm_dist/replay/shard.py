@@ -2,6 +2,7 @@
 
 import copy
 import json
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -132,6 +133,18 @@ class ReplayShard:
             "inserted_blocks": self._inserted_blocks,
             "duplicate_blocks": self._duplicate_blocks,
         }
+
+    def freeze(self, lock: threading.Lock) -> dict[str, Any]:
+        """The state of now, for `snapshot.write_snapshot`, whatever is inserted or drawn before `thaw`.
+
+        Args:
+            lock: held here, by each insert and by `thaw`, but not while the state is read.
+        """
+        return self.view() | {"ring": self._ring.freeze(lock)}
+
+    def thaw(self) -> None:
+        """Nobody reads the frozen state any more."""
+        self._ring.thaw()
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Take over a saved state: the same draws follow as would have.

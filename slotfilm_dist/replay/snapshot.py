@@ -16,6 +16,7 @@ import numpy as np
 from slotfilm_dist.atomic import TEMPORARY_SUFFIX, FileDigest, check_file, write_atomic
 from slotfilm_dist.config import check, to_dict
 from slotfilm_dist.replay.codec import DTYPES, decode, encode
+from slotfilm_dist.replay.frozen import FrozenColumn
 from slotfilm_dist.replay.schema import Column
 
 MANIFEST = "manifest.json"
@@ -35,7 +36,7 @@ _PREFIX = "replay-"
 def write_snapshot(directory: Path, state: Mapping[str, Any]) -> None:
     """Write a state of nested mappings, scalars and arrays; takes no memory beyond one chunk.
 
-    Give it `ReplayShard.view()`, which copies nothing.
+    Give it `ReplayShard.view()`, which copies nothing, or `ReplayShard.freeze()` while others go on inserting.
 
     Raises:
         OSError: the disk is full or not writable; the previous snapshot stays and nothing of the new one is left.
@@ -44,7 +45,7 @@ def write_snapshot(directory: Path, state: Mapping[str, Any]) -> None:
     generation, kept = _previous(directory)
     _remove_files(directory, kept)
     generation += 1
-    arrays: dict[str, np.ndarray] = {}
+    arrays: dict[str, np.ndarray | FrozenColumn] = {}
     rest = _take_arrays(state, "", arrays)
     try:
         files: dict[str, FileDigest] = {}
@@ -98,13 +99,15 @@ def read_snapshot(directory: Path) -> dict[str, Any]:
     return state
 
 
-def _take_arrays(state: Mapping[str, Any], prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+def _take_arrays(state: Mapping[str, Any], prefix: str, arrays: dict[str, np.ndarray | FrozenColumn]) -> dict[str, Any]:
     """The state without its large arrays, which are collected under their dotted path."""
     rest: dict[str, Any] = {}
     for key, value in state.items():
         check(key.isidentifier(), "state", prefix + key, "keys become file names and must be identifiers")
-        if isinstance(value, np.ndarray) and value.nbytes >= LARGE_BYTES:
+        if isinstance(value, np.ndarray | FrozenColumn) and value.nbytes >= LARGE_BYTES:
             arrays[prefix + key] = value
+        elif isinstance(value, FrozenColumn):
+            rest[key] = value.rows(0, value.shape[0])
         elif isinstance(value, Mapping):
             rest[key] = _take_arrays(value, f"{prefix}{key}.", arrays)
         else:
@@ -112,12 +115,14 @@ def _take_arrays(state: Mapping[str, Any], prefix: str, arrays: dict[str, np.nda
     return rest
 
 
-def _chunks(array: np.ndarray) -> Iterator[bytes]:
+def _chunks(array: np.ndarray | FrozenColumn) -> Iterator[bytes]:
     """The array's bytes, little-endian, in order; a chunk is copied at a time."""
-    rows = max(1, _CHUNK_BYTES // max(1, array[:1].nbytes))
+    num_rows = array.shape[0]
+    rows = max(1, _CHUNK_BYTES * num_rows // array.nbytes)
     little = array.dtype.newbyteorder("<")
-    for start in range(0, len(array), rows):
-        yield array[start : start + rows].astype(little, copy=False).tobytes()
+    for start in range(0, num_rows, rows):
+        chunk = array.rows(start, start + rows) if isinstance(array, FrozenColumn) else array[start : start + rows]
+        yield chunk.astype(little, copy=False).tobytes()
 
 
 def _signed(manifest: dict[str, Any]) -> bytes:

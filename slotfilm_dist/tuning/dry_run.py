@@ -43,6 +43,7 @@ def describe(
         "job_hours": sum(e.hours for e in estimates.values()),
         "hours": total_hours(todo, estimates, at_once),
         "kept_bytes": sum(e.kept_bytes for e in estimates.values()),
+        "hours_by_name": _hours_by_name(trials, estimates),
         "disk_bytes": sum(e.kept_bytes for e in estimates.values()) + sum(largest[: max(at_once, 1)]),
         "hours_source": SOURCE,
     }
@@ -74,9 +75,34 @@ def show(plan: dict[str, Any], grid: Path, console: Console) -> None:
         f"artifacts.\nHours come from the costs of single steps on {plan['hours_source']}.",
         soft_wrap=True,
     )
+    if costly := _costly(plan):
+        console.print(
+            f"Most of the hours are those of {', '.join(f'{name} ({_hours(h)} h)' for name, h in costly.items())}: "
+            "`--exclude` them where there is no GPU.",
+            soft_wrap=True,
+        )
     if plan["no_room"]:
         lacking = dict.fromkeys(row["name"] for row in plan["jobs"] if row["key"] in plan["no_room"])
         console.print(f"The cluster has no room for {', '.join(lacking)} as it is now.", style="red", soft_wrap=True)
+
+
+def _hours_by_name(trials: Sequence[Job], estimates: Mapping[str, JobEstimate]) -> dict[str, float]:
+    """Hours of all seeds of a variant, the longest first."""
+    hours: dict[str, float] = {}
+    for job in trials:
+        hours[job.config.variant] = hours.get(job.config.variant, 0.0) + estimates[job.key].hours
+    return dict(sorted(hours.items(), key=lambda item: -item[1]))
+
+
+def _costly(plan: dict[str, Any]) -> dict[str, float]:
+    """The fewest variants that make up nine tenths of the hours; none where that is more than half of the variants."""
+    hours, taken = plan["hours_by_name"], 0.0
+    costly: dict[str, float] = {}
+    for name, own in hours.items():
+        if taken >= 0.9 * plan["job_hours"]:
+            break
+        costly[name], taken = own, taken + own
+    return costly if 2 * len(costly) <= len(hours) else {}
 
 
 def _row(job: Job, resources: TrialResources, taken: JobEstimate) -> dict[str, Any]:

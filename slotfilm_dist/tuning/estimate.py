@@ -2,8 +2,13 @@
 
 The costs are CPU times of one core (AMD EPYC, torch 2.14 on one thread, software rendering, 2026-11-22), each the mean
 of 1 to 150 repetitions with random numbers as input, at the paper's batch of 128 (256 for DrQ-v2). Updates scale with
-the batch. A GPU was not measured: there, an update of a pixel agent costs a small part of this, and hours from here
-are an upper bound that may lie far off.
+the batch. A job's hours follow from its config (steps, updates, episodes, agent) and the cores that it is given;
+starting processes and writing files is left out, seconds to half a minute a job. The proposed agent at `quick` comes
+out at 4.7 minutes on Ray with two workers on two cores, data and pre-training included, where 4 to 6.5 were measured.
+
+An agent that learns from pixels costs hundreds of times as much per update: on CPUs those few variants are nearly all
+of a grid's hours. A GPU was not measured: there such an update costs a small part of this, and hours from here are an
+upper bound that may lie far off.
 """
 
 from collections.abc import Mapping, Sequence
@@ -88,20 +93,25 @@ def _env_step_s(config: RunConfig) -> float:
     return ENV_STEP_S["camera" if config.encoder.uses_image else "blind"]
 
 
-def _num_envs(resources: TrialResources) -> float:
-    """Environments that step at the same time, counted in cores: workers, without learner and player."""
-    return max(resources.num_roles - 2, 1) * min(resources.role_cpus, 1.0)
+def _cores(resources: TrialResources, num_roles: int) -> float:
+    """Cores that so many roles compute on while the trial's others wait; each computes on one at most."""
+    return min(num_roles, resources.num_cpus)
+
+
+def _num_workers(resources: TrialResources) -> int:
+    """Processes that step environments: all but learner and player, or the only one."""
+    return max(resources.num_roles - 2, 1)
 
 
 def _collect_s(config: RunConfig, resources: TrialResources) -> float:
-    return config.schedule.random_steps * _env_step_s(config) / _num_envs(resources)
+    return config.schedule.random_steps * _env_step_s(config) / _cores(resources, _num_workers(resources))
 
 
 def _pretrain_s(config: RunConfig, resources: TrialResources) -> float:
     pretrain = config.pretrain
     step = PRETRAIN_STEP_S[pretrain.train_backbone] * pretrain.batch_size / PAPER_BATCH
     encoding = config.schedule.random_steps * ENCODE_FRAME_S if pretrain.train_backbone == "none" else 0.0
-    return (pretrain.steps * step + encoding) / min(resources.role_cpus, 1.0)
+    return (pretrain.steps * step + encoding) / _cores(resources, 1)
 
 
 def _train_s(config: RunConfig, resources: TrialResources) -> float:
@@ -109,24 +119,26 @@ def _train_s(config: RunConfig, resources: TrialResources) -> float:
     steps = config.schedule.total_steps - config.schedule.random_steps
     act = ACT_S[agent if agent in ("state", "slots") else "slots" if agent == "end_to_end" else "pixels"]
     update = UPDATE_S[agent] * config.sac.batch_size / PAPER_BATCH
-    share = min(resources.role_cpus, 1.0)
-    acting = steps * (_env_step_s(config) + act) / _num_envs(resources)
-    learning = steps * config.schedule.updates_per_step * update / share
+    acting = steps * (_env_step_s(config) + act)
+    learning = steps * config.schedule.updates_per_step * update
+    workers = _cores(resources, _num_workers(resources))
+    # In one process they take turns; on Ray the slower of the two sets the pace, or the cores that they share.
+    together = (acting + learning) / resources.num_cpus
+    one = (acting + learning) / _cores(resources, 1)
+    training = one if resources.num_roles == 1 else max(acting / workers, learning / _cores(resources, 1), together)
     encoding = config.schedule.random_steps * ENCODE_FRAME_S if agent == "slots" else 0.0
-    # In one process they take turns; on Ray the slower of the two sets the pace.
-    training = acting + learning if resources.num_roles == 1 else max(acting, learning)
     every = config.evaluation.every_steps
     during = (steps // every) * config.evaluation.during_episodes if every else 0
     # The final evaluation plays the random policy as well.
     played = (during + 2 * config.evaluation.episodes) * config.env.max_steps
-    return encoding / share + training + played * (_env_step_s(config) + act) / _num_envs(resources)
+    return encoding / _cores(resources, 1) + training + played * (_env_step_s(config) + act) / workers
 
 
 def _kept_bytes(job: Job) -> float:
     config = job.config
     if job.kind == "data":
         picture = 3 * config.env.image_size**2 if config.encoder.uses_image else 0
-        return config.schedule.random_steps * (picture + 4.0 * config.obs.state_dim + 100)
+        return config.schedule.random_steps * (picture + 4.0 * config.obs.state_dim + 150)
     if job.kind == "encoder":
         return ENCODER_BYTES
     checkpoints = (config.checkpoint.keep + 1) * SAVED_BYTES[_agent(config)]

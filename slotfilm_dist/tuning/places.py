@@ -1,6 +1,6 @@
 """Where a trial's roles live: in its placement group on Ray, or all in the trial's own process."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 from slotfilm_dist.backend import Backend
@@ -15,7 +15,12 @@ MakeBackend = Callable[[RunConfig, Path, TrialResources], Backend]
 """Builds a backend from a config, the run's directory, and what its placement group holds."""
 
 
-class PlacedBackend(RayBackend):
+def placed_backend(
+    config: RunConfig,
+    run: Path,
+    resources: TrialResources,
+    make_env: Callable[[RunConfig, bool], VectorEnv] = make_wrist_env,
+) -> RayBackend:
     """`RayBackend` in a placement group: its roles ask for what the group holds, whatever else the cluster has.
 
     Args:
@@ -24,48 +29,32 @@ class PlacedBackend(RayBackend):
         resources: what the group holds.
         make_env: builds an environment; a function at the top of a module.
     """
+    return RayBackend(config, run, make_env, placement=placement_in_group(config, resources))
 
-    def __init__(
-        self,
-        config: RunConfig,
-        run: Path,
-        resources: TrialResources,
-        make_env: Callable[[RunConfig, bool], VectorEnv] = make_wrist_env,
-    ) -> None:
-        self._resources = resources
-        self._state_resources: Mapping[str, float] = {}
-        super().__init__(config, run, make_env)
 
-    @property
-    def _placement(self) -> Placement:
-        """What the roles ask for.
+def placement_in_group(config: RunConfig, resources: TrialResources) -> Placement:
+    """What the roles of a trial ask for.
 
-        With a GPU the learner asks for no cores, although the group holds them: a worker may have come first and taken
-        those that lie beside the GPU, and the learner cannot live elsewhere.
-        """
-        gpus, cpus = self._resources.num_gpus, self._resources.role_cpus
-        central = infers_centrally(self._config, gpu=gpus > 0)
-        share = gpus / 2 if central else gpus
-        return Placement(
-            share_cpus=cpus,
-            gpu=gpus > 0,
-            learner_cpus=0.0 if gpus else cpus,
-            learner_gpus=share,
-            central_inference=central,
-            inference_gpus=share if central else 0.0,
-            state_resources=self._state_resources,
-        )
-
-    @_placement.setter
-    def _placement(self, of_the_cluster: Placement) -> None:
-        """What the cluster as a whole could give is not this trial's, but for where roles with state belong."""
-        self._state_resources = of_the_cluster.state_resources
+    With a GPU, or on a node for state, the learner asks for no cores, although the group holds them: a worker may have
+    come first and taken those that lie there, and the learner cannot live elsewhere.
+    """
+    gpus, cpus = resources.num_gpus, resources.role_cpus
+    central = infers_centrally(config, gpu=gpus > 0)
+    share = gpus / 2 if central else gpus
+    return Placement(
+        share_cpus=cpus,
+        gpu=gpus > 0,
+        learner_cpus=0.0 if gpus or resources.state_token else cpus,
+        learner_gpus=share,
+        central_inference=central,
+        inference_gpus=share if central else 0.0,
+    )
 
 
 def make_backend(config: RunConfig, run: Path, resources: TrialResources) -> Backend:
     """The backend that `runtime.mode` names."""
     if config.runtime.mode == "ray":
-        return PlacedBackend(config, run, resources)
+        return placed_backend(config, run, resources)
     from slotfilm_dist.local import LocalBackend
 
     return LocalBackend(config)

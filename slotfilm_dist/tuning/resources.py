@@ -10,6 +10,8 @@ from slotfilm_dist.cluster.placement import (
     TOKEN,
     WORKER_RESOURCE,
     infers_centrally,
+    nodes_for,
+    num_roles_that_fit,
 )
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.replay.memory import replay_bytes
@@ -42,7 +44,7 @@ class TrialResources:
     state_token: float = 0.0
     """Of the resource of nodes for roles with state, where there are such nodes."""
     worker_token: float = 0.0
-    """Of the resource of nodes for workers, for each bundle beside the learner's."""
+    """Of the resource of nodes for workers, for each bundle of a worker or a player."""
 
     @property
     def num_cpus(self) -> float:
@@ -53,17 +55,24 @@ class TrialResources:
     def bundles(self) -> list[dict[str, float]]:
         """Bundles of the placement group; the first is that of the process which drives the trial.
 
-        On Ray the driving process computes nothing: its bundle holds the memory of all roles, which none of them asks
-        for by itself, so that Ray never packs more trials onto a node than fit. The learner's bundle comes second.
+        On Ray the driving process computes nothing: its bundle holds the memory of replay and learner, as the others
+        hold that of a worker or player, which no role asks for by itself; so Ray never packs more trials onto a node
+        than fit. The learner's bundle comes second. These two, or all of a run in one process, go where state belongs.
         """
-        memory = float(self.memory_bytes // _MIB * _MIB)
         gpus = {"GPU": self.num_gpus} if self.num_gpus else {}
-        if self.num_roles == 1:
-            return [{"CPU": self.role_cpus, "memory": memory} | gpus]
         state = {STATE_RESOURCE: self.state_token} if self.state_token else {}
-        worker = {WORKER_RESOURCE: self.worker_token} if self.worker_token else {}
+        kept = {"memory": _whole_mib(self.kept_bytes)} | state
         role = {"CPU": self.role_cpus}
-        return [{"memory": memory}, role | gpus | state, *(role | worker for _ in range(self.num_roles - 1))]
+        if self.num_roles == 1:
+            return [role | kept | gpus]
+        worker = {WORKER_RESOURCE: self.worker_token} if self.worker_token else {}
+        worker |= {"memory": _whole_mib(ROLE_BYTES)}
+        return [kept, role | gpus | state, *(role | worker for _ in range(self.num_roles - 1))]
+
+    @property
+    def kept_bytes(self) -> int:
+        """Memory of what must not be lost: replay and learner, or a whole run in one process."""
+        return self.memory_bytes - (self.num_roles - 1) * ROLE_BYTES
 
 
 def runs_on_ray(config: RunConfig, nodes: Nodes) -> bool:
@@ -96,19 +105,21 @@ def job_resources(
     num_gpus = _gpus(config, nodes, gpus_per_trial)
     central = infers_centrally(config, gpu=num_gpus > 0)
     num_roles = config.runtime.num_workers + OTHER_ROLES + central if on_ray else 1
-    cores = sum(node.get("CPU", 0.0) for node in nodes)
+    state_nodes, worker_nodes = nodes_for(nodes, STATE_RESOURCE), nodes_for(nodes, WORKER_RESOURCE)
+    needs = ((nodes, num_roles), (state_nodes, 1), (worker_nodes, num_roles - 1))
     if cpus_per_trial is not None:
         # Ray counts in ten-thousandths of a core.
         role_cpus = max(int(cpus_per_trial / num_roles * 10_000) / 10_000, 0.0001)
     else:
-        role_cpus = next((share for share in SHARES if share * num_roles <= cores), SHARES[-1])
+        fitting = (s for s in SHARES if all(num_roles_that_fit(on, s) >= num for on, num in needs))
+        role_cpus = next(fitting, SHARES[-1])
     return TrialResources(
         num_roles=num_roles,
         role_cpus=role_cpus,
         num_gpus=num_gpus,
         # Hub, learner, central inference and shards take a token each.
         state_token=TOKEN * (3 + config.replay.num_shards) if _offered(STATE_RESOURCE, nodes) else 0.0,
-        worker_token=TOKEN * config.runtime.num_workers if _offered(WORKER_RESOURCE, nodes) else 0.0,
+        worker_token=TOKEN * config.runtime.num_workers if on_ray and _offered(WORKER_RESOURCE, nodes) else 0.0,
         memory_bytes=_stored_bytes(job) + (num_roles * ROLE_BYTES if on_ray else LOCAL_BYTES),
     )
 
@@ -121,14 +132,15 @@ def fit_to_resources(config: RunConfig, resources: TrialResources) -> RunConfig:
 
 
 def num_that_fit(resources: TrialResources, nodes: Nodes) -> int:
-    """Trials that run at the same time on the cluster, as far as its totals say."""
-    needed = {"CPU": resources.num_cpus, "GPU": resources.num_gpus, "memory": float(resources.memory_bytes)}
-    fits = [
-        int(sum(node.get(name, 0.0) for node in nodes) / amount + 1e-6)
-        for name, amount in needed.items()
-        if amount and any(name in node for node in nodes)
-    ]
-    return min(fits, default=0) if not (resources.num_gpus and not any("GPU" in node for node in nodes)) else 0
+    """Trials that run at the same time, as far as the totals of the cluster and of its two kinds of nodes say."""
+    if resources.num_gpus and not any("GPU" in node for node in nodes):
+        return 0
+    bundles = resources.bundles
+    for_state = bundles if len(bundles) == 1 else bundles[:2]
+    for_workers = bundles[len(for_state) :]
+    groups = ((nodes, bundles), (nodes_for(nodes, STATE_RESOURCE), for_state))
+    groups += ((nodes_for(nodes, WORKER_RESOURCE), for_workers),) if resources.worker_token else ()
+    return min((_num_on(on, asked) for on, asked in groups), default=0)
 
 
 def check_fits(key: str, resources: TrialResources, nodes: Nodes) -> None:
@@ -142,6 +154,17 @@ def check_fits(key: str, resources: TrialResources, nodes: Nodes) -> None:
         f"{resources.memory_bytes / 1e9:.1f} GB of memory; the cluster has {cores:g}, {gpus:g} and {memory / 1e9:.1f} "
         "GB. Give --cpus-per-trial or --gpus-per-trial a smaller number, or set --replay.capacity lower"
     )
+
+
+def _num_on(nodes: Nodes, bundles: Sequence[Mapping[str, float]]) -> int:
+    """How often these bundles fit into the totals of some nodes; what no node tells is not counted."""
+    needed = {name: sum(bundle.get(name, 0.0) for bundle in bundles) for name in ("CPU", "GPU", "memory")}
+    totals = {name: sum(node.get(name, 0.0) for node in nodes) for name in needed if any(name in n for n in nodes)}
+    return min((int(totals[name] / needed[name] + 1e-6) for name in totals if needed[name]), default=0)
+
+
+def _whole_mib(num_bytes: int) -> float:
+    return float(num_bytes // _MIB * _MIB)
 
 
 def _stored_bytes(job: Job) -> int:

@@ -15,10 +15,10 @@ from typing import Any
 from rich.console import Console
 
 from slotfilm_dist.evaluation.record import read_run
+from slotfilm_dist.pipeline import Pipeline
 from slotfilm_dist.progress import Phase, Progress
 from slotfilm_dist.runs import RunDirectory
 from slotfilm_dist.stopping import Interrupted, StopFlag
-from slotfilm_dist.tuning.artifacts import SharingPipeline
 from slotfilm_dist.tuning.jobs import Job
 from slotfilm_dist.tuning.ledger import Ledger
 from slotfilm_dist.tuning.places import MakeBackend
@@ -183,7 +183,7 @@ class Work:
         try:
             backend.prepare()
             with RunDirectory(path, job.config) as run:
-                pipeline = SharingPipeline(run, backend, orders.artifacts, self._standing, stop)
+                pipeline = Pipeline(run, backend, orders.artifacts, self._standing, stop)
                 if job.kind == "trial":
                     pipeline.execute()
                 else:

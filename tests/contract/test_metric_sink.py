@@ -54,6 +54,8 @@ def test_names_labels_and_values_are_the_same_wherever_they_are_read(served: tup
         "ray_slotfilm_limiter_ratio role=limiter worker=": 0.5,
         "ray_slotfilm_learner_updates_total role=learner worker=": 40.0,
         "ray_slotfilm_worker_restarts_total reason=hang role=worker worker=": 2.0,
+        "ray_slotfilm_worker_restarts_total reason=crash role=worker worker=": 0.0,
+        "ray_slotfilm_checkpoint_failed_total role=checkpoint worker=": 0.0,
         "ray_slotfilm_env_steps role=run worker=": 7.0,
         "ray_slotfilm_learner_update_s_count role=learner worker=": 1.0,
         "ray_slotfilm_learner_update_s_bucket le=0.01 role=learner worker=": 0.0,

@@ -1,12 +1,15 @@
-"""A run on the toy environment, watched by a real Prometheus with the project's own configuration."""
+"""A run on the toy environment that a real Prometheus watches, and homes of clusters that users start by hand."""
 
+import contextlib
 import itertools
 import json
 import math
 import os
+import secrets
 import shutil
 import socket
 import subprocess
+import tempfile
 import time
 import urllib.error
 import urllib.parse
@@ -34,6 +37,8 @@ REPORT_INTERVAL = "RAY_metrics_report_interval_ms"
 """How often Ray's processes report their metrics to the agent that Prometheus asks; Ray spells it like this."""
 START_S = 30.0
 """Longest wait for Prometheus to answer."""
+CLUSTER_START_S = 90.0
+"""Longest wait for a cluster of two nodes on a loaded machine."""
 Series = dict[tuple[tuple[str, str], ...], list[float]]
 """Values over time by labels."""
 
@@ -117,6 +122,10 @@ class WatchedRun:
         """Values of a query during the run."""
         return self.prometheus.over_time(query, self.start, self.end)
 
+    def seconds_since_start(self) -> float:
+        """Since before its first sample."""
+        return time.time() - self.start
+
     def without_data(self, queries: Iterable[str]) -> list[str]:
         """Those of the queries that gave not one finite value."""
         return [q for q in queries if not any(map(math.isfinite, itertools.chain(*self.values(q).values())))]
@@ -130,17 +139,20 @@ def free_port() -> int:
 
 
 def watched_config(metrics_port: int) -> RunConfig:
-    """Every phase once, with an evaluation and several checkpoints in between, on as few processes as that takes."""
+    """Every phase, with evaluations and checkpoints in between, on as few processes as that takes.
+
+    Learning lasts for several of Ray's reports even on a fast machine: a rate needs two samples.
+    """
     base = apply_variant("slotfilm", smoke())
-    schedule = replace(base.schedule, total_steps=440, random_steps=200, updates_per_step=0.5)
+    schedule = replace(base.schedule, total_steps=4000, random_steps=200, updates_per_step=0.5)
     runtime = replace(base.runtime, mode="ray", num_workers=1, block_steps=16, learner_threads=1, device="cpu")
     return replace(
         base,
         env=replace(base.env, max_steps=20),
         pretrain=replace(base.pretrain, steps=10),
         schedule=schedule,
-        evaluation=replace(base.evaluation, episodes=1, every_steps=150, during_episodes=1, videos=0),
-        checkpoint=replace(base.checkpoint, every_updates=30),
+        evaluation=replace(base.evaluation, episodes=1, every_steps=1000, during_episodes=1, videos=0),
+        checkpoint=replace(base.checkpoint, every_updates=200),
         runtime=replace(runtime, metrics_port=metrics_port),
     )
 
@@ -165,7 +177,7 @@ def watched(tmp_path_factory: pytest.TempPathFactory, program: Callable[[str], s
     folder = tmp_path_factory.mktemp("watched")
     config = watched_config(free_port())
     prometheus = Prometheus(folder, free_port())
-    os.environ[REPORT_INTERVAL] = "2000"  # milliseconds; 10 s otherwise
+    os.environ[REPORT_INTERVAL] = "1000"  # milliseconds; 10 s otherwise
     try:
         start = time.time()
         with RunDirectory(folder / "watched", config) as run:
@@ -190,3 +202,78 @@ def list_ray_endpoints(path: Path) -> None:
     writer = PrometheusServiceDiscoveryWriter(ray.get_runtime_context().gcs_address, str(path.parent))
     writer.write()
     assert Path(writer.get_target_file_name()) == path
+
+
+class Home:
+    """A home directory of its own, in which a cluster file's commands run as they stand, but for ports.
+
+    Args:
+        folder: with a short path; the sockets below it may have no more than 107 characters.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.token = secrets.token_hex(32)
+        (folder / "slotfilm_dist").symlink_to(OPS.parent)
+        (folder / ".ray").mkdir()
+        (folder / ".ray" / "auth_token").touch(mode=0o600)
+        (folder / ".ray" / "auth_token").write_text(self.token)
+        self._started: list[subprocess.Popen[bytes]] = []
+
+    def start(self, command: str, **environment: str) -> None:
+        """Run a command that stays."""
+        kept = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+        with (self.folder / f"{len(self._started)}.log").open("wb") as log:
+            self._started.append(
+                subprocess.Popen(
+                    ["bash", "-c", command],
+                    env={**kept, "HOME": str(self.folder), **environment},
+                    cwd=self.folder,
+                    stdout=log,
+                    stderr=log,
+                    start_new_session=True,
+                )
+            )
+
+    def free_ports(self, count: int) -> list[int]:
+        """Loopback ports that nobody uses now."""
+        with contextlib.ExitStack() as stack:
+            probes = [stack.enter_context(socket.socket()) for _ in range(count)]
+            for probe in probes:
+                probe.bind(("127.0.0.1", 0))
+            return [probe.getsockname()[1] for probe in probes]
+
+    def get(self, url: str, token: str = "") -> tuple[int, str]:
+        """Status and text of an answer; 0 while nobody answers."""
+        request = urllib.request.Request(url, headers={"Authorization": f"Bearer {token}"} if token else {})
+        try:
+            with urllib.request.urlopen(request, timeout=10) as answer:
+                return answer.status, answer.read().decode()
+        except urllib.error.HTTPError as error:
+            return error.code, ""
+        except OSError:
+            return 0, ""
+
+    def wait(self, what: str, condition: Callable[[], bool]) -> None:
+        """Wait for a condition, with the logs in the failure."""
+        deadline = time.monotonic() + CLUSTER_START_S
+        while not condition():
+            if time.monotonic() > deadline:
+                logs = [path.read_text()[-2000:] for path in sorted(self.folder.glob("*.log"))]
+                pytest.fail(f"no {what} within {CLUSTER_START_S:g} s\n" + "\n".join(logs))
+            time.sleep(0.3)
+
+    def close(self) -> None:
+        """End what was started, and nothing else."""
+        for process in self._started:
+            process.terminate()
+        for process in self._started:
+            process.wait(60)
+
+
+@pytest.fixture
+def home() -> Iterator[Home]:
+    with tempfile.TemporaryDirectory(prefix="slotfilm-", ignore_cleanup_errors=True) as folder:
+        made = Home(Path(folder))
+        yield made
+        made.close()

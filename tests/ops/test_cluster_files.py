@@ -1,18 +1,8 @@
 """The cluster launcher's files are what Ray accepts, and a cluster started by their commands is closed to strangers."""
 
-import contextlib
 import importlib.metadata
 import json
-import os
 import re
-import secrets
-import socket
-import subprocess
-import tempfile
-import time
-import urllib.error
-import urllib.request
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +16,6 @@ from slotfilm_dist.cluster.placement import STATE_RESOURCE, WORKER_RESOURCE
 
 ROOT = Path(__file__).parents[2]
 AWS, LOCAL = ROOT / "cluster.yaml", ROOT / "ops" / "cluster-local.yaml"
-START_S = 90.0
-"""Longest wait for a cluster of two nodes on a loaded machine."""
 
 
 def config_of(path: Path) -> dict[str, Any]:
@@ -102,89 +90,13 @@ def test_nodes_install_what_is_pinned() -> None:
         assert any("-c ops/constraints.txt" in line for line in config_of(path)["setup_commands"])
 
 
-class Home:
-    """A home directory of its own, in which a cluster file's commands run as they stand, but for ports.
-
-    Args:
-        folder: with a short path; the sockets below it may have no more than 107 characters.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.token = secrets.token_hex(32)
-        (folder / "slotfilm_dist").symlink_to(ROOT)
-        (folder / ".ray").mkdir()
-        (folder / ".ray" / "auth_token").touch(mode=0o600)
-        (folder / ".ray" / "auth_token").write_text(self.token)
-        self._started: list[subprocess.Popen[bytes]] = []
-
-    def start(self, command: str, **environment: str) -> None:
-        """Run a command that stays."""
-        kept = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
-        with (self.folder / f"{len(self._started)}.log").open("wb") as log:
-            self._started.append(
-                subprocess.Popen(
-                    ["bash", "-c", command],
-                    env={**kept, "HOME": str(self.folder), **environment},
-                    cwd=self.folder,
-                    stdout=log,
-                    stderr=log,
-                    start_new_session=True,
-                )
-            )
-
-    def get(self, url: str, token: str = "") -> tuple[int, str]:
-        """Status and text of an answer; 0 while nobody answers."""
-        request = urllib.request.Request(url, headers={"Authorization": f"Bearer {token}"} if token else {})
-        try:
-            with urllib.request.urlopen(request, timeout=10) as answer:
-                return answer.status, answer.read().decode()
-        except urllib.error.HTTPError as error:
-            return error.code, ""
-        except OSError:
-            return 0, ""
-
-    def wait(self, what: str, condition: Callable[[], bool]) -> None:
-        """Wait for a condition, with the logs in the failure."""
-        deadline = time.monotonic() + START_S
-        while not condition():
-            if time.monotonic() > deadline:
-                logs = [path.read_text()[-2000:] for path in sorted(self.folder.glob("*.log"))]
-                pytest.fail(f"no {what} within {START_S:g} s\n" + "\n".join(logs))
-            time.sleep(0.3)
-
-    def close(self) -> None:
-        """End what was started, and nothing else."""
-        for process in self._started:
-            process.terminate()
-        for process in self._started:
-            process.wait(60)
-
-
-@pytest.fixture
-def home() -> Iterator[Home]:
-    with tempfile.TemporaryDirectory(prefix="slotfilm-", ignore_cleanup_errors=True) as folder:
-        made = Home(Path(folder))
-        yield made
-        made.close()
-
-
-def free_ports(count: int) -> list[int]:
-    """Loopback ports that nobody uses now."""
-    with contextlib.ExitStack() as stack:
-        probes = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for probe in probes:
-            probe.bind(("127.0.0.1", 0))
-        return [probe.getsockname()[1] for probe in probes]
-
-
-def test_cluster_of_two_nodes_starts_from_the_local_file_and_refuses_who_has_no_token(home: Home) -> None:
+def test_cluster_of_two_nodes_starts_from_the_local_file_and_refuses_who_has_no_token(home: Any) -> None:
     """Ray's own start commands of `ops/cluster-local.yaml`, for a head and one worker on this machine."""
     config = config_of(LOCAL)
     config["provider"] |= {"head_ip": "127.0.0.1", "worker_ips": []}  # the test starts the worker itself, without ssh
     (home.folder / "ray_bootstrap_config.yaml").write_text(yaml.safe_dump(prepare_config(config)))
     (home.folder / "slotfilm-resources.json").write_text(json.dumps({STATE_RESOURCE: 1000}))
-    gcs, dashboard, first, second = free_ports(4)
+    gcs, dashboard, first, second = home.free_ports(4)
     head = started_by(config["head_start_ray_commands"]).replace("6379", str(gcs)).replace("8265", str(dashboard))
     home.start(head.replace("8080", str(first)) + f" --temp-dir={home.folder} --block")
     page = f"http://127.0.0.1:{dashboard}"

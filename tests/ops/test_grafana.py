@@ -13,7 +13,6 @@ GRAFANA = Path(__file__).parents[2] / "ops" / "grafana"
 DASHBOARDS = sorted((GRAFANA / "dashboards").glob("*.json"))
 EMPTY_PANELS = {
     "Alerts": "nothing is wrong",
-    "Workers replaced": "no worker is lost",
     "GPU": "the run has none",
 }
 """Panels without data in a healthy run on a CPU, each with the reason."""
@@ -46,6 +45,25 @@ def test_every_panel_gives_data(watched: Any, path: Path) -> None:
     queries = {query_of(target): panel["title"] for panel in panels_of(path) for target in panel["targets"]}
     empty = {queries[query] for query in watched.without_data(queries)}
     assert empty <= EMPTY_PANELS.keys(), empty
+
+
+def test_table_of_panels_has_a_value_for_every_panel_with_data(watched: Any) -> None:
+    url = f"http://127.0.0.1:{watched.prometheus.port}"
+    seconds = str(watched.seconds_since_start())
+    command = [sys.executable, str(GRAFANA.parent / "panels.py"), url, "--over", seconds]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True, timeout=120).stdout
+    _, _, *lines = printed.splitlines()
+    values = {panel: value for _, panel, value, _ in (line.strip("| ").split(" | ") for line in lines)}
+    assert {panel for panel, value in values.items() if value == "-"} <= EMPTY_PANELS.keys()
+    assert values.keys() >= EMPTY_PANELS.keys()
+    assert values["Updates per environment step"].startswith("0.")
+
+
+def test_table_of_panels_says_when_prometheus_is_not_there() -> None:
+    command = [sys.executable, str(GRAFANA.parent / "panels.py"), "http://127.0.0.1:1"]
+    answer = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert answer.returncode == 2
+    assert "is Prometheus running there?" in answer.stderr
 
 
 @pytest.mark.parametrize("path", DASHBOARDS, ids=lambda path: path.stem)

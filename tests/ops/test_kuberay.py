@@ -12,21 +12,37 @@ from slotfilm_dist.cluster.placement import STATE_RESOURCE, WORKER_RESOURCE
 
 ROOT = Path(__file__).parents[2]
 KUBERAY = ROOT / "ops" / "kuberay"
-CLUSTER_FIELDS = {
-    *("authOptions", "suspend", "managedBy", "autoscalerOptions", "headServiceAnnotations", "enableInTreeAutoscaling"),
-    *("gcsFaultToleranceOptions", "headGroupSpec", "rayVersion", "workerGroupSpecs"),
+WORDS = {
+    "serviceType": {"ClusterIP"},
+    "version": {"v1", "v2"},
+    "upscalingMode": {"Default", "Aggressive", "Conservative"},
 }
-JOB_FIELDS = {
-    *("activeDeadlineSeconds", "backoffLimit", "rayClusterSpec", "submitterPodTemplate", "metadata", "clusterSelector"),
-    *("submitterConfig", "managedBy", "deletionStrategy", "entrypoint", "runtimeEnvYAML", "jobId", "submissionMode"),
-    *("entrypointResources", "entrypointNumCpus", "entrypointNumGpus", "ttlSecondsAfterFinished", "suspend"),
-    "shutdownAfterJobFinishes",
+WORDS |= {"submissionMode": {"K8sJobMode", "HTTPMode", "InteractiveMode"}}
+"""The only words that fields take."""
+CLUSTER_FIELDS = {
+    **{"suspend": bool, "managedBy": str, "autoscalerOptions": dict, "headServiceAnnotations": dict},
+    **{"enableInTreeAutoscaling": bool, "gcsFaultToleranceOptions": dict, "headGroupSpec": dict, "rayVersion": str},
+    "workerGroupSpecs": list,
+}
+AUTOSCALER_FIELDS = {
+    **{"resources": dict, "image": str, "imagePullPolicy": str, "securityContext": dict, "idleTimeoutSeconds": int},
+    **{"upscalingMode": str, "version": str, "env": list, "envFrom": list, "volumeMounts": list},
+}
+HEAD_FIELDS = {
+    **{"template": dict, "headService": dict, "enableIngress": bool, "rayStartParams": dict, "serviceType": str},
 }
 GROUP_FIELDS = {
-    *("groupName", "replicas", "minReplicas", "maxReplicas", "idleTimeoutSeconds", "numOfHosts", "rayStartParams"),
-    *("template", "scaleStrategy", "suspend", "serviceType", "headService", "enableIngress"),
+    **{"suspend": bool, "groupName": str, "replicas": int, "minReplicas": int, "maxReplicas": int},
+    **{"idleTimeoutSeconds": int, "rayStartParams": dict, "template": dict, "scaleStrategy": dict, "numOfHosts": int},
 }
-"""Fields of KubeRay's `ray.io/v1` types, from their definition."""
+JOB_FIELDS = {
+    **{"activeDeadlineSeconds": int, "backoffLimit": int, "rayClusterSpec": dict, "submitterPodTemplate": dict},
+    **{"metadata": dict, "clusterSelector": dict, "submitterConfig": dict, "managedBy": str, "deletionStrategy": dict},
+    **{"entrypoint": str, "runtimeEnvYAML": str, "jobId": str, "submissionMode": str, "entrypointResources": str},
+    **{"entrypointNumCpus": float, "entrypointNumGpus": float, "ttlSecondsAfterFinished": int, "suspend": bool},
+    "shutdownAfterJobFinishes": bool,
+}
+"""Fields of KubeRay's `ray.io/v1` types with their types, from the reference of its API."""
 POLICY, CLAIM, CLUSTER = yaml.safe_load_all((KUBERAY / "cluster.yaml").read_text())
 JOB = yaml.safe_load((KUBERAY / "grid.yaml").read_text())
 SPEC = CLUSTER["spec"]
@@ -42,17 +58,32 @@ def container_of(pod: dict[str, Any]) -> dict[str, Any]:
     return container
 
 
-def test_manifests_use_fields_that_kuberay_has() -> None:
+def misfits(values: dict[str, Any], fields: dict[str, type], required: set[str]) -> list[str]:
+    """What the API server would refuse in an object of KubeRay's."""
+    wrong = [name for name, value in values.items() if name not in fields or type(value) is not fields[name]]
+    return (
+        wrong
+        + [name for name in required - values.keys()]
+        + [n for n in WORDS.keys() & values if values[n] not in WORDS[n]]
+    )
+
+
+def test_manifests_use_fields_that_kuberay_has_as_it_has_them() -> None:
     assert CLUSTER["apiVersion"] == JOB["apiVersion"] == "ray.io/v1"
     assert (CLUSTER["kind"], JOB["kind"]) == ("RayCluster", "RayJob")
-    assert SPEC.keys() <= CLUSTER_FIELDS
-    assert JOB["spec"].keys() <= JOB_FIELDS
+    assert misfits(SPEC, CLUSTER_FIELDS, {"headGroupSpec"}) == []
+    assert misfits(SPEC["autoscalerOptions"], AUTOSCALER_FIELDS, set()) == []
+    assert misfits(SPEC["headGroupSpec"], HEAD_FIELDS, {"rayStartParams", "template"}) == []
+    assert misfits(JOB["spec"], JOB_FIELDS, set()) == []
+    assert misfits(JOB["spec"]["submitterConfig"], {"backoffLimit": int}, set()) == []
+    for group in SPEC["workerGroupSpecs"]:
+        wanted = {"groupName", "minReplicas", "maxReplicas", "rayStartParams", "template"}
+        assert misfits(group, GROUP_FIELDS, wanted) == []
+        assert group["minReplicas"] <= group["replicas"] <= group["maxReplicas"]
     for group in GROUPS:
-        assert group.keys() <= GROUP_FIELDS
         assert all(isinstance(value, str) for value in group["rayStartParams"].values())
     assert {container_of(group["template"])["name"] for group in SPEC["workerGroupSpecs"]} == {"ray-worker"}
     assert container_of(SPEC["headGroupSpec"]["template"])["name"] == "ray-head"
-    assert SPEC["autoscalerOptions"]["version"] == "v2"
 
 
 def test_job_and_cluster_are_the_same_cluster() -> None:

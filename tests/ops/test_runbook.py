@@ -7,6 +7,8 @@ import yaml
 
 OPS = Path(__file__).parents[2] / "ops"
 RULES = [r for g in yaml.safe_load((OPS / "prometheus/rules/alerts.yml").read_text())["groups"] for r in g["rules"]]
+OTHERS = ["Jobs", "Machines of your own"]
+"""Sections that are no alert's, at the end."""
 
 
 def sections() -> dict[str, str]:
@@ -16,11 +18,13 @@ def sections() -> dict[str, str]:
 
 
 def test_every_alert_has_a_section_and_every_section_an_alert() -> None:
-    assert list(sections()) == [rule["alert"] for rule in RULES]
+    assert list(sections()) == [*(rule["alert"] for rule in RULES), *OTHERS]
 
 
 def test_every_section_says_what_it_means_how_to_see_it_and_what_to_do() -> None:
     for name, text in sections().items():
+        if name in OTHERS:
+            continue
         assert [word for word in ("**Means.**", "**See.**", "**Do.**") if word not in text] == [], name
 
 

@@ -3,35 +3,27 @@
 import csv
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from slotfilm_dist.__main__ import main
-from slotfilm_dist.config import save_config
-from slotfilm_dist.learning.checkpoint import CheckpointStore
-from slotfilm_dist.learning.learner import Learner
+from slotfilm_dist.config import RunConfig
 from slotfilm_dist.presets import smoke
 from slotfilm_dist.variants import apply_variant
 
 pytestmark = [pytest.mark.sim, pytest.mark.render]
 
 
-def write_run(folder: Path, variant: str) -> Path:
+def small(variant: str) -> RunConfig:
     base = apply_variant(variant, smoke())
-    config = dataclasses.replace(
+    return dataclasses.replace(
         base,
         env=dataclasses.replace(base.env, image_size=32, max_steps=40),
         runtime=dataclasses.replace(base.runtime, learner_threads=1, device="cpu"),
     )
-    learner = Learner(config, 7, torch.device("cpu"))
-    learner.begin_rl(None)
-    folder.mkdir(parents=True)
-    save_config(config, folder / "config.json")
-    CheckpointStore(folder / "checkpoints", 1).write(learner.checkpoint({"limiter": {"env_steps": 12}}), 0)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +32,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run(place: Path) -> Path:
-    return write_run(place / "slotfilm", "slotfilm")
+def run(place: Path, write_agent_run: Callable[..., Path]) -> Path:
+    return write_agent_run(place / "slotfilm", small("slotfilm"))
 
 
 def result(capsys: pytest.CaptureFixture[str], *words: str) -> dict:
@@ -68,10 +60,10 @@ def test_perception_writes_its_folder(run: Path, place: Path, capsys: pytest.Cap
 
 
 def test_probes_of_two_variants_read_identical_frames(
-    run: Path, place: Path, capsys: pytest.CaptureFixture[str]
+    run: Path, place: Path, write_agent_run: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ("--episodes", "2", "--artifacts", str(place / "artifacts"))
-    blind = write_run(place / "state_only", "state_only")
+    blind = write_agent_run(place / "state_only", small("state_only"))
     first = result(capsys, "probe", str(run), *words)
     frames = sorted((place / "artifacts").glob("frames-*.npz"), key=lambda path: path.stat().st_mtime_ns)
     second = result(capsys, "probe", str(blind), *words)

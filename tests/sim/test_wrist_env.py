@@ -106,7 +106,7 @@ def test_near_field_is_the_way_to_the_goal_squeezed() -> None:
     obs = replace(RunConfig().obs, state_fields=fields, state_dim=6)
     env = WristEnv(replace(RunConfig(), obs=obs), camera=False)
     proprio = env.reset([5]).proprio
-    np.testing.assert_allclose(proprio[:, 3:], np.tanh(proprio[:, :3] / 0.02), rtol=1e-5)
+    np.testing.assert_allclose(proprio[:, 3:], np.tanh(proprio[:, :3] / 0.05), rtol=1e-5)
     env.close()
 
 

@@ -27,6 +27,7 @@ LEVELS: dict[str, int] = {
     "backend": 0,
     "seeds": 0,
     "stopping": 0,
+    "artifacts": 4,
     "envs": 1,
     "nets": 1,
     "replay": 1,

@@ -2,7 +2,16 @@ import re
 
 import pytest
 
-from slotfilm_dist.metrics import AXES, METRICS, PHASES, check_names, find_metric, phase_index
+from slotfilm_dist.metrics import (
+    AXES,
+    METRICS,
+    PHASES,
+    RESTART_REASONS,
+    check_names,
+    find_metric,
+    phase_index,
+    zero_counters,
+)
 
 ROLES = {
     "inference",
@@ -37,6 +46,18 @@ def test_unit_suffix_says_the_unit():
         for suffix, unit in suffixes.items():
             if name.endswith(suffix) and not name.endswith("_per_s"):
                 assert metric.unit == unit, name
+
+
+def test_counts_of_rare_events_begin_at_zero_for_every_reason():
+    zeros = zero_counters()
+    check_names(zeros)
+    assert set(zeros.values()) == {0.0}
+    assert {key for key in zeros if key.startswith("learner")} == {
+        f"learner_restarts_total/{reason}" for reason in RESTART_REASONS
+    }
+    assert "checkpoint_failed_total" in zeros
+    assert all(m.from_zero for m in METRICS.values() if m.kind == "counter" and m.label_values)
+    assert "learner_updates_total" not in zeros
 
 
 def test_axes_are_metrics_of_the_run():

@@ -9,14 +9,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from filelock import FileLock
 from rich.console import Console
 
 from slotfilm_dist.backend import Player, TrainReport
 from slotfilm_dist.config import RunConfig, load_config
+from slotfilm_dist.envs.reward import NUM_INPUTS, TERMS
 from slotfilm_dist.messages import EpisodeSummary, TransitionBlock
 from slotfilm_dist.pipeline import Pipeline
 from slotfilm_dist.presets import smoke
 from slotfilm_dist.progress import Progress
+from slotfilm_dist.replay.dataset import open_dataset
 from slotfilm_dist.runs import RunDirectory
 from slotfilm_dist.stopping import Interrupted, StopFlag
 from slotfilm_dist.variants import apply_variant
@@ -121,10 +124,12 @@ def config_of(every_steps: int = 0) -> RunConfig:
     return replace(config, evaluation=replace(config.evaluation, every_steps=every_steps))
 
 
-def execute(path: Path, backend: CountingBackend, stop: StopFlag | None = None) -> Path:
-    quiet = Progress(Console(file=io.StringIO()))
+def execute(
+    path: Path, backend: CountingBackend, stop: StopFlag | None = None, progress: Progress | None = None
+) -> Path:
+    progress = progress or Progress(Console(file=io.StringIO()))
     with RunDirectory(path / "run", backend.config) as run:
-        return Pipeline(run, backend, path / "artifacts", quiet, stop or StopFlag()).execute()
+        return Pipeline(run, backend, path / "artifacts", progress, stop or StopFlag()).execute()
 
 
 def test_phases_come_in_order_and_leave_a_report(tmp_path: Path) -> None:
@@ -149,6 +154,86 @@ def test_second_run_takes_the_data_that_are_there_and_a_finished_run_only_evalua
     again = CountingBackend(config_of())
     execute(tmp_path, again)
     assert again.calls == ["load agent", "play random 10000000+2", "play agent 10000000+2"]
+
+
+class OtherRun(Progress):
+    """Another run, which does its own part as soon as this one says that it waits."""
+
+    def __init__(self, act: Callable[[], None]) -> None:
+        super().__init__(Console(file=io.StringIO()))
+        self._act = act
+        self.waited = 0
+
+    def say(self, text: str) -> None:
+        if "another run is making random-" in text:
+            self.waited += 1
+            self._act()
+
+
+def test_run_waits_for_the_data_that_another_run_is_making_and_takes_them(tmp_path: Path) -> None:
+    execute(tmp_path / "other", CountingBackend(config_of()))
+    (made,) = (tmp_path / "other" / "artifacts").glob("random-*")
+    artifacts = tmp_path / "artifacts"
+    artifacts.mkdir()
+    lock = FileLock(artifacts / f".{made.name}.lock")
+
+    def finish() -> None:
+        made.rename(artifacts / made.name)
+        lock.release()
+
+    backend, other = CountingBackend(config_of()), OtherRun(finish)
+    lock.acquire()
+    execute(tmp_path, backend, progress=other)
+    assert other.waited == 1
+    assert backend.calls[0] == "begin"
+
+
+def test_stop_ends_the_wait_for_another_run(tmp_path: Path) -> None:
+    execute(tmp_path / "other", CountingBackend(config_of()))
+    (made,) = (tmp_path / "other" / "artifacts").glob("random-*")
+    (tmp_path / "artifacts").mkdir()
+    stop = StopFlag()
+
+    def interrupt() -> None:
+        stop.signal_number = int(signal.SIGTERM)
+
+    with FileLock(tmp_path / "artifacts" / f".{made.name}.lock"), pytest.raises(Interrupted, match="SIGTERM"):
+        execute(tmp_path, CountingBackend(config_of()), stop, OtherRun(interrupt))
+
+
+def test_data_that_are_there_need_no_lock(tmp_path: Path) -> None:
+    execute(tmp_path, CountingBackend(config_of()))
+    (made,) = (tmp_path / "artifacts").glob("random-*")
+    other = OtherRun(lambda: None)
+    with FileLock(tmp_path / "artifacts" / f".{made.name}.lock"):
+        execute(tmp_path, CountingBackend(config_of()), progress=other)
+    assert other.waited == 0
+
+
+class PaperRewardBackend(CountingBackend):
+    """Steps of an environment with the paper's reward: the inputs of step i are i."""
+
+    reward_term_names = TERMS
+
+    def random_blocks(self, num_steps: int, start: int) -> Iterator[TransitionBlock]:
+        for block in super().random_blocks(num_steps, start):
+            inputs = np.repeat(np.arange(block.num_rows, dtype=np.float32)[:, None], NUM_INPUTS, axis=1)
+            yield replace(block, reward_inputs=inputs, episodes=())
+
+
+def test_data_of_the_papers_reward_hold_its_inputs_and_others_the_reward(tmp_path: Path) -> None:
+    for name, kind in (("paper", PaperRewardBackend), ("own", CountingBackend)):
+        backend = kind(config_of())
+        backend.play = CountingBackend(config_of()).play
+        with RunDirectory(tmp_path / name, backend.config) as run:
+            quiet = Progress(Console(file=io.StringIO()))
+            Pipeline(run, backend, tmp_path / f"artifacts-{name}", quiet, StopFlag()).make_artifacts(encoder=False)
+    (paper,) = (tmp_path / "artifacts-paper").glob("random-*")
+    (own,) = (tmp_path / "artifacts-own").glob("random-*")
+    inputs = open_dataset(paper, paper.name.removeprefix("random-")).reward_inputs
+    assert inputs is not None
+    assert inputs[:41, 0].tolist() == list(range(41))
+    assert open_dataset(own, own.name.removeprefix("random-")).reward_inputs is None
 
 
 def test_evaluations_during_training_come_on_time_and_keep_the_best(tmp_path: Path) -> None:

@@ -21,8 +21,9 @@ class CountingEnv:
     action_dim = 2
     reward_term_names: tuple[str, ...] = ("count",)
 
-    def __init__(self, num_envs: int = 1, *, terminates: bool = False) -> None:
+    def __init__(self, num_envs: int = 1, *, terminates: bool = False, gives_inputs: bool = False) -> None:
         self.num_envs = num_envs
+        self._gives_inputs = gives_inputs
         self.executed: list[np.ndarray] = []
         self.started: list[int] = []
         self._terminates = terminates
@@ -53,6 +54,7 @@ class CountingEnv:
             grasped=reward == 20,
             contact=none,
             reward_terms=reward[:, None],
+            reward_inputs=np.stack((reward, reward + 1), axis=1) if self._gives_inputs else None,
         )
 
     def close(self) -> None:
@@ -102,6 +104,18 @@ def test_every_steps_next_frame_lies_in_its_own_block(num_envs: int) -> None:
         assert (block.proprio[next_rows(block), 1] == block.proprio[steps, 1] + 1).all()
         assert (block.proprio[next_rows(block), 0] == block.proprio[steps, 0]).all()
         assert (block.reward[steps] == 10 * block.proprio[steps, 1]).all()
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_rewards_inputs_stay_with_their_step_and_are_zero_without_one(num_envs: int) -> None:
+    loop = loop_in(CountingEnv(num_envs, gives_inputs=True))
+    for _ in range(4):
+        block = loop.collect(3)
+        assert block.reward_inputs is not None
+        steps = block.is_step
+        assert np.array_equal(block.reward_inputs[steps], np.stack((block.reward, block.reward + 1), axis=1)[steps])
+        assert not block.reward_inputs[~steps].any()
+    assert loop_in(CountingEnv(num_envs)).collect(3).reward_inputs is None
 
 
 def test_action_stored_is_the_action_executed() -> None:

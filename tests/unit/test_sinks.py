@@ -7,7 +7,7 @@ import urllib.request
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from slotfilm_dist.metrics import phase_index
+from slotfilm_dist.metrics import RESTART_REASONS, phase_index
 from slotfilm_dist.sinks import FanOut, JsonLinesSink, PrometheusSink, TensorBoardSink
 
 
@@ -143,6 +143,32 @@ def test_prometheus_serves_gauges_counters_and_labels():
     assert 'ray_slotfilm_worker_restarts_total{reason="hang",role="worker",run="a",worker=""} 2.0' in text
     assert "# TYPE ray_slotfilm_worker_restarts_total counter" in text
     assert "# TYPE ray_slotfilm_limiter_ratio gauge" in text
+
+
+def test_prometheus_sees_counts_of_rare_events_at_zero_before_the_first_one():
+    sink = PrometheusSink(0, labels={"run": "a"})
+    try:
+        before = scrape(sink)
+        sink.write({"worker_restarts_total/hang": 1})
+        after = scrape(sink)
+    finally:
+        sink.close()
+    for reason in RESTART_REASONS:
+        line = f'ray_slotfilm_worker_restarts_total{{reason="{reason}",role="worker",run="a",worker=""}}'
+        assert f"{line} 0.0" in before
+        assert f"{line} {float(reason == 'hang')}" in after
+    assert 'ray_slotfilm_checkpoint_failed_total{role="checkpoint",run="a",worker=""} 0.0' in before
+    assert "ray_slotfilm_learner_updates_total" not in before
+
+
+def test_values_that_are_not_finite_are_counted_for_every_sink():
+    kept = PrometheusSink(0)
+    with FanOut([kept]) as sink:
+        sink.write({"learner_critic_loss": math.nan, "learner_q_mean": math.inf})
+        sink.write({"learner_q_mean": 2.5})
+        text = scrape(kept)
+    assert sink.num_nonfinite == 2
+    assert 'ray_slotfilm_sink_nonfinite_total{role="sink",worker=""} 2.0' in text
 
 
 def test_prometheus_histogram_counts_every_observation_once():

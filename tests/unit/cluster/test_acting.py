@@ -52,6 +52,34 @@ class Published:
         return answer
 
 
+class Waits:
+    """Notes what is waited for, and ends the wait when told to."""
+
+    def __init__(self, last: int = 1 << 30) -> None:
+        self.texts: list[str] = []
+        self.last = last
+
+    def __call__(self, waiting_for: str) -> None:
+        self.texts.append(waiting_for)
+        if len(self.texts) >= self.last:
+            raise StopIteration
+
+
+class Answering:
+    """A hub that answers as long as it is told to: its first weights, then that there are none newer."""
+
+    def __init__(self) -> None:
+        self.answers = threading.Event()
+        self.answers.set()
+        self.asked = threading.Semaphore(0)
+
+    def await_newer(self, newer_than: int, timeout_s: float) -> WeightSnapshot | None:
+        self.asked.release()
+        if not self.answers.wait(0.01):
+            raise RoleSilentError("hub", "newer weights", 0.01)
+        return snapshot(0) if newer_than < 0 else None
+
+
 SEEN = Observation(
     rgb=None,
     proprio=np.zeros((1, 35), np.float32),
@@ -83,7 +111,7 @@ def test_newest_weights_win_and_older_ones_are_left_alone() -> None:
 
 def test_first_weights_are_waited_for_and_the_lag_of_later_ones_is_told_once() -> None:
     hub = Published()
-    following = FollowingPolicy(Recorder(), hub)
+    following = FollowingPolicy(Recorder(), hub, Waits())
     assert not following.await_weights(0.01)
     assert following.version == -1
     hub.add(snapshot(0, published_at_s=time.time() - 2.0))
@@ -112,17 +140,70 @@ def test_weights_are_not_loaded_in_the_middle_of_an_action() -> None:
 
 def test_silent_hub_leaves_the_old_weights_acting() -> None:
     hub = Published(snapshot(0), RoleSilentError("hub", "newer weights", 1.0), snapshot(1))
-    following = FollowingPolicy(Recorder(), hub)
+    following = FollowingPolicy(Recorder(), hub, Waits())
     until(lambda: following.version == 1)
     following.close()
 
 
 def test_lost_hub_is_raised_where_the_policy_acts() -> None:
     hub = Published(snapshot(0))
-    following = FollowingPolicy(Recorder(), hub)
+    following = FollowingPolicy(Recorder(), hub, Waits())
     assert following.await_weights(10.0)
     hub.add(RoleLostError("hub", "crash", "killed"))
     with pytest.raises(RoleLostError, match="hub is gone: killed"):
         until(lambda: following.act(SEEN, NO_VISUAL)[0, 0] == 1)
     with pytest.raises(RoleLostError):
         following.await_weights(10.0)
+
+
+def test_weights_of_any_age_act_while_the_hub_says_that_there_are_none_newer() -> None:
+    hub, now = Answering(), [0.0]
+    follower = WeightFollower(Recorder(), hub, max_staleness_s=10.0, clock=lambda: now[0])
+    assert follower.await_first(10.0)
+    now[0] = 1e6
+    assert follower.await_fresh(10.0)
+    assert follower.silence_s == 0
+    follower.close()
+
+
+def test_weights_go_stale_without_a_word_and_are_fresh_again_with_one() -> None:
+    hub, now = Answering(), [0.0]
+    follower = WeightFollower(Recorder(), hub, max_staleness_s=10.0, clock=lambda: now[0])
+    assert follower.await_first(10.0)
+    hub.answers.clear()
+    while hub.asked.acquire(blocking=False):
+        pass
+    # The answer to the question before the last may still have been under way, that to the last is not.
+    assert hub.asked.acquire(timeout=10.0)
+    assert hub.asked.acquire(timeout=10.0)
+    now[0] = 10.0
+    assert follower.await_fresh(0.0)
+    now[0] = 10.5
+    assert not follower.await_fresh(0.0)
+    hub.answers.set()
+    assert follower.await_fresh(10.0)
+    follower.close()
+
+
+def test_policy_pauses_while_its_weights_are_stale_and_names_the_hub(caplog: pytest.LogCaptureFixture) -> None:
+    hub, waits = Answering(), Waits()
+    following = FollowingPolicy(Recorder(), hub, waits, max_staleness_s=0.3)
+    assert following.await_weights(10.0)
+    hub.answers.clear()
+    threading.Timer(1.0, hub.answers.set).start()
+    until(lambda: following.act(SEEN, NO_VISUAL) is not None and waits.texts)
+    assert "the hub: no word for" in waits.texts[0]
+    assert "runtime.max_staleness_s = 0.3" in waits.texts[0]
+    assert "waiting for the hub" in caplog.messages[0]
+    assert "the hub answers again" in caplog.messages[1]
+    following.close()
+
+
+def test_pause_ends_when_the_worker_is_told_to_stop() -> None:
+    hub = Answering()
+    following = FollowingPolicy(Recorder(), hub, Waits(last=2), max_staleness_s=0.05)
+    assert following.await_weights(10.0)
+    hub.answers.clear()
+    with pytest.raises(StopIteration):
+        until(lambda: following.act(SEEN, NO_VISUAL) is None)
+    following.close()

@@ -4,7 +4,14 @@ from dataclasses import replace
 
 import pytest
 
-from slotfilm_dist.cluster.placement import STATE_RESOURCE, WORKER_RESOURCE, infers_centrally, place, plan
+from slotfilm_dist.cluster.placement import (
+    STATE_RESOURCE,
+    WORKER_RESOURCE,
+    infers_centrally,
+    num_roles_that_fit,
+    place,
+    plan,
+)
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.presets import smoke
 from slotfilm_dist.variants import apply_variant
@@ -57,6 +64,11 @@ def test_learner_and_central_inference_share_the_only_gpu(gpus: float, learner: 
     assert (placement.learner_gpus, placement.inference_gpus) == (learner, inference)
     alone = plan(config_with(num_workers=2, inference="worker"), [{"CPU": 8.0, "GPU": gpus}])
     assert (alone.learner_gpus, alone.inference_gpus) == (1.0, 0.0)
+
+
+def test_role_finds_its_cores_on_one_node() -> None:
+    assert num_roles_that_fit([{"CPU": 1.5}, {"CPU": 1.5}, {"memory": 1.0}], 1.0) == 2
+    assert num_roles_that_fit([{"CPU": 1.5}, {"CPU": 1.5}], 0.5) == 6
 
 
 def test_nodes_are_asked_for_by_their_resource_only_while_one_offers_it() -> None:

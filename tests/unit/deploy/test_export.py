@@ -13,10 +13,9 @@ import pytest
 import torch
 
 from slotfilm_dist.__main__ import main
-from slotfilm_dist.config import RunConfig, save_config
+from slotfilm_dist.config import RunConfig
 from slotfilm_dist.deploy.export import COMPARISONS, export_policy, policy_inputs, random_observation
 from slotfilm_dist.deploy.loader import FILES, MANIFEST, load_policy
-from slotfilm_dist.learning.checkpoint import CheckpointStore
 from slotfilm_dist.learning.learner import Learner
 from slotfilm_dist.messages import Observation
 from slotfilm_dist.policy import AgentPolicy
@@ -62,8 +61,8 @@ def tiny(variant: str) -> RunConfig:
     )
 
 
-def write_run(folder: Path, variant: str) -> Learner:
-    """A run's config and checkpoint, of an agent whose every weight and statistic is away from where it begins."""
+def altered(variant: str) -> Learner:
+    """An agent whose every weight and statistic is away from where it begins."""
     config = tiny(variant)
     learner = Learner(config, ACTION_DIM, torch.device("cpu"), fetch_weights=False)
     learner.begin_rl(None)
@@ -72,9 +71,6 @@ def write_run(folder: Path, variant: str) -> Learner:
         for parameter in [*learner.encoder.fusion_parameters(), *learner.rl.actor.parameters()]:
             parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
     learner.encoder.set_state_statistics(torch.linspace(-1, 1, 35), torch.linspace(0.5, 2, 35))
-    folder.mkdir(parents=True)
-    save_config(config, folder / "config.json")
-    CheckpointStore(folder / "checkpoints", 2).write(learner.checkpoint({"limiter": {"env_steps": 5}}), 3)
     return learner
 
 
@@ -93,12 +89,13 @@ def own_actions(learner: Learner, observations: dict[str, np.ndarray]) -> np.nda
 
 
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def exported(tmp_path_factory: pytest.TempPathFactory, write_agent_run: Callable[..., Path]) -> Path:
     """A folder for each variant: its exported policy, observations, and what the agent itself does at them."""
     folder = tmp_path_factory.mktemp("exported")
     for variant in READ_BY:
         run = tmp_path_factory.mktemp("runs") / "run"
-        learner = write_run(run, variant)
+        learner = altered(variant)
+        write_agent_run(run, learner.config, learner)
         formats = ("torch", "onnx") if variant in AS_ONNX else ("torch",)
         export_policy(run, folder / variant / "policy", formats=formats)
         rng, inputs = np.random.default_rng(7), policy_inputs(learner.config)
@@ -133,7 +130,7 @@ def test_policy_says_what_it_reads_and_how_that_is_normalised(exported: Path, va
     assert tuple(manifest["inputs"]) == READ_BY[variant]
     assert manifest["config"]["variant"] == variant
     assert manifest["action"]["size"] == ACTION_DIM
-    assert (manifest["env_steps"], manifest["updates"]) == (5, 0)
+    assert (manifest["env_steps"], manifest["updates"]) == (12, 0)
     assert sum(manifest["state_fields"].values()) == 35
     if "proprio" in READ_BY[variant]:
         assert manifest["normalization"]["proprio"]["mean"] == pytest.approx(np.linspace(-1, 1, 35), abs=1e-6)
@@ -199,8 +196,10 @@ def test_damaged_file_is_refused_and_named(exported: Path, tmp_path: Path, name:
             load_policy(tmp_path / "policy", backend)
 
 
-def test_command_reports_latency_and_difference(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_run(tmp_path / "run", "state_only")
+def test_command_reports_latency_and_difference(
+    tmp_path: Path, write_agent_run: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_agent_run(tmp_path / "run", tiny("state_only"), altered("state_only"))
     assert main(["export", str(tmp_path / "run"), "--format", "torch", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["out"] == str(tmp_path / "run" / "export")
@@ -211,18 +210,22 @@ def test_command_reports_latency_and_difference(tmp_path: Path, capsys: pytest.C
         load_policy(tmp_path / "run" / "export", "onnx")
 
 
-def test_difference_beyond_the_tolerance_leaves_nothing_behind(tmp_path: Path) -> None:
-    write_run(tmp_path / "run", "drqv2")
+def test_difference_beyond_the_tolerance_leaves_nothing_behind(
+    tmp_path: Path, write_agent_run: Callable[..., Path]
+) -> None:
+    write_agent_run(tmp_path / "run", tiny("drqv2"), altered("drqv2"))
     with pytest.raises(ValueError, match=r"policy\.onnx differs from the agent by .*--tolerance"):
         export_policy(tmp_path / "run", tmp_path / "out", formats=("onnx",), tolerance=0.0)
     assert COMPARISONS > 10
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
 
 
-def test_what_is_no_run_or_no_place_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_run_or_no_place_is_refused(
+    tmp_path: Path, write_agent_run: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["export", str(tmp_path / "nowhere")]) == 2
     assert "is no run directory: it has no config.json" in capsys.readouterr().err
-    write_run(tmp_path / "run", "state_only")
+    write_agent_run(tmp_path / "run", tiny("state_only"), altered("state_only"))
     assert main(["export", str(tmp_path / "run"), "--out", str(tmp_path / "run"), "--format", "torch"]) == 2
     assert "holds no exported policy; choose another --out" in capsys.readouterr().err
     assert (tmp_path / "run" / "config.json").exists()

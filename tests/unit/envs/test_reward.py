@@ -4,11 +4,23 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from slotfilm_dist.config import RewardConfig, RewardWeights, SuccessConfig
-from slotfilm_dist.envs.reward import RewardTerms, max_reward, progress, reward_terms, shaped
+from slotfilm_dist.envs.reward import (
+    TERMS,
+    RewardInputs,
+    RewardTerms,
+    max_reward,
+    num_reward_inputs,
+    progress,
+    reward_inputs,
+    reward_terms,
+    rewards_of,
+    shaped,
+)
 from slotfilm_dist.envs.scene import SceneState
 
 DEFAULT = RewardConfig()
@@ -37,7 +49,7 @@ def scene(
 
 def terms(config: RewardConfig, **state: Any) -> RewardTerms:
     here = scene(**state)
-    return reward_terms(here, progress(here, config, SuccessConfig()), config)
+    return reward_terms(reward_inputs(here, progress(here, config, SuccessConfig())), config)
 
 
 def near(value: torch.Tensor, expected: float) -> bool:
@@ -165,3 +177,45 @@ def test_success_is_placed_and_still_and_released_where_asked() -> None:
 )
 def test_upper_bound_of_the_reward(fields: dict[str, Any], bound: float) -> None:
     assert max_reward(replace(DEFAULT, **fields)) == pytest.approx(bound)
+
+
+def drawn_inputs(count: int) -> RewardInputs:
+    """Instants on both sides of every threshold."""
+    generator = torch.Generator().manual_seed(3)
+    return RewardInputs(
+        object_to_tcp_m=torch.rand(count, generator=generator) * 0.1,
+        object_to_goal_m=torch.rand(count, generator=generator) * 0.06,
+        grasped=(torch.rand(count, generator=generator) < 0.5).float(),
+        qvel=torch.randn(count, 9, generator=generator) * 0.2,
+    )
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        DEFAULT,
+        replace(DEFAULT, alpha=5.0, near_form="inverse", pg_form="exp", place_gate="none"),
+        replace(DEFAULT, varpi=1.0, static_norm="max", static_joints="all", pg_form="exp_alpha", normalize="none"),
+        replace(DEFAULT, near_form="exp_only", weights=RewardWeights(static=0.0)),
+    ],
+)
+def test_rewards_of_many_stored_steps_are_those_of_each_step_bit_for_bit(config: RewardConfig) -> None:
+    packed = drawn_inputs(301).packed()
+    alone = [float(reward_terms(RewardInputs.unpacked(row[None]), config).total()) for row in packed]
+    assert rewards_of(packed.numpy(), config).tolist() == alone
+    assert len(set(alone)) > 250
+
+
+def test_packed_inputs_come_back_bit_for_bit_and_of_their_number() -> None:
+    inputs = drawn_inputs(5)
+    packed = inputs.packed()
+    assert packed.shape == (5, num_reward_inputs(TERMS))
+    back = RewardInputs.unpacked(packed)
+    for name in ("object_to_tcp_m", "object_to_goal_m", "grasped", "qvel"):
+        assert getattr(back, name).equal(getattr(inputs, name)), name
+    with pytest.raises(ValueError, match="reward_inputs: 11 numbers a step, expected 12"):
+        rewards_of(np.zeros((2, 11), np.float32), DEFAULT)
+
+
+def test_environment_with_a_reward_of_its_own_stores_the_reward() -> None:
+    assert num_reward_inputs(("reward",)) == num_reward_inputs(("reach",)) == 0

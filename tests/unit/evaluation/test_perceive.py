@@ -13,15 +13,12 @@ from pathlib import Path
 import imageio.v2 as imageio
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from slotfilm_dist.__main__ import main
-from slotfilm_dist.config import save_config
+from slotfilm_dist.config import RunConfig
 from slotfilm_dist.evaluation.camera_sources import mjpeg_pictures, pictures, square
 from slotfilm_dist.evaluation.mjpeg import StreamBroken, jpeg_parts
-from slotfilm_dist.learning.checkpoint import CheckpointStore
-from slotfilm_dist.learning.learner import Learner
 from slotfilm_dist.presets import smoke
 from slotfilm_dist.variants import apply_variant
 
@@ -188,25 +185,18 @@ def test_middle_square_keeps_proportions() -> None:
     assert (square(small, 30) == small).all()
 
 
-def write_checkpoint_of(folder: Path, variant: str = "slotfilm") -> Path:
-    """A run directory with a checkpoint of untrained networks."""
+def small(variant: str) -> RunConfig:
     base = apply_variant(variant, smoke())
-    config = dataclasses.replace(
+    return dataclasses.replace(
         base,
         env=dataclasses.replace(base.env, image_size=32),
         runtime=dataclasses.replace(base.runtime, learner_threads=1, device="cpu"),
     )
-    learner = Learner(config, 7, torch.device("cpu"))
-    learner.begin_rl(None)
-    folder.mkdir(parents=True)
-    save_config(config, folder / "config.json")
-    CheckpointStore(folder / "checkpoints", 1).write(learner.checkpoint({"limiter": {"env_steps": 12}}), 0)
-    return folder
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_checkpoint_of(tmp_path_factory.mktemp("runs") / "run")
+def run(tmp_path_factory: pytest.TempPathFactory, write_agent_run: Callable[..., Path]) -> Path:
+    return write_agent_run(tmp_path_factory.mktemp("runs") / "run", small("slotfilm"))
 
 
 def test_perceiving_a_video_writes_a_video_and_its_numbers(
@@ -278,8 +268,10 @@ def test_mistakes_are_named(
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 
 
-def test_agent_without_slots_cannot_perceive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    blind = write_checkpoint_of(tmp_path / "blind", "state_only")
+def test_agent_without_slots_cannot_perceive(
+    tmp_path: Path, write_agent_run: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    blind = write_agent_run(tmp_path / "blind", small("state_only"))
     Image.fromarray(grey(9)).save(tmp_path / "a.png")
     words = ["perceive", str(tmp_path / "a.png"), "--checkpoint", str(blind), "--out", str(tmp_path / "o.png")]
     assert main(words) == 2

@@ -253,3 +253,65 @@ def test_tokens_and_missing_labels_are_refused(tmp_path, schema, picture_schema)
 def test_empty_dataset_cannot_be_finished(tmp_path, picture_schema):
     with FrameDatasetWriter(tmp_path, picture_schema, "h") as writer, pytest.raises(ValueError, match="num_rows"):
         writer.finish()
+
+
+@pytest.fixture
+def input_schema(picture_schema):
+    return replace(picture_schema, num_reward_inputs=3)
+
+
+@pytest.fixture
+def with_inputs(make_block, input_schema):
+    """A block of steps k whose reward's inputs are k, k + 1, k + 2, also in the rows without a step."""
+
+    def with_inputs(first_step: int, num_steps: int, **values):
+        block = make_block(first_step, num_steps, schema=input_schema, **values)
+        inputs = block.proprio[:, :1] + np.arange(3, dtype=np.float32)
+        return replace(block, reward_inputs=inputs)
+
+    return with_inputs
+
+
+def test_dataset_with_the_rewards_inputs_gives_each_reader_the_reward_it_computes(tmp_path, input_schema, with_inputs):
+    with FrameDatasetWriter(tmp_path, input_schema, "h") as writer:
+        for i in range(4):
+            writer.append(with_inputs(10 * i, 10, sequence=i))
+        writer.finish()
+    assert not (tmp_path / "reward.npy").exists()
+    dataset = open_dataset(tmp_path, "h")
+    assert dataset.reward is None
+    for factor in (1, -2):
+        for block in dataset.blocks(25, lambda inputs, factor=factor: factor * inputs.sum(axis=1)):
+            expected = np.where(block.is_step, factor * (3 * block.proprio[:, 0] + 3), 0)
+            np.testing.assert_array_equal(block.reward, expected)
+            assert block.reward.dtype == np.float32
+    with pytest.raises(ValueError, match="reward_of"):
+        next(dataset.blocks(25))
+
+
+def test_stored_reward_is_not_computed_anew(write):
+    dataset = open_dataset(write(), "h1")
+    rewards = np.concatenate([block.reward for block in dataset.blocks(25, lambda inputs: inputs.sum(axis=1))])
+    np.testing.assert_array_equal(rewards, dataset.reward)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "complaint"),
+    [
+        (None, r"reward_inputs: missing, expected \(11, 3\)"),
+        (np.zeros((11, 2), np.float32), r"reward_inputs: shape \(11, 2\)"),
+        (np.full((11, 3), np.nan, np.float32), "reward_inputs: not finite in row 0"),
+    ],
+)
+def test_block_without_fitting_inputs_is_refused(tmp_path, input_schema, make_block, altered, inputs, complaint):
+    block = altered(make_block(0, 10, schema=input_schema), reward_inputs=inputs)
+    with FrameDatasetWriter(tmp_path, input_schema, "h") as writer, pytest.raises(ValueError, match=complaint):
+        writer.append(block)
+
+
+def test_dataset_of_an_older_layout_is_refused_with_what_to_do(write):
+    directory = write()
+    path = directory / "manifest.json"
+    path.write_text(path.read_text().replace('"format": 2', '"format": 1'))
+    with pytest.raises(ValueError, match="format 2; delete the directory and collect again"):
+        open_dataset(directory, "h1")

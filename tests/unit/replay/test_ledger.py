@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slotfilm_dist.replay import codec
@@ -15,6 +15,7 @@ def arrives(ledger: BlockLedger, sequence: int, worker_id: int = 0, incarnation:
     return is_new
 
 
+@settings(deadline=None)
 @given(arrivals=st.lists(st.tuples(st.integers(0, 2), st.integers(0, 1), st.integers(0, 30)), max_size=200))
 def test_every_block_is_new_exactly_once_in_any_order(arrivals):
     ledger, seen = BlockLedger(), set()

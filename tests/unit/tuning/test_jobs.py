@@ -34,18 +34,29 @@ def test_every_distinct_artifact_is_made_once_and_before_its_trials() -> None:
     variants = ["slotfilm", "no_state", "alpha_5", "state_only", "cnn", "slots_4"]
     jobs = build_jobs(build_trials(smoke(), variants, 1))
     trials = {job.config.variant: job for job in jobs if job.kind == "trial"}
-    # State-only has data without pictures, another reward its own, DrQ and CNN the pictures of the proposed agent.
-    assert sum(job.kind == "data" for job in jobs) == 3
+    # State-only has data without pictures; all others, also with another reward, share the proposed agent's.
+    assert sum(job.kind == "data" for job in jobs) == 2
     assert sum(job.kind == "encoder" for job in jobs) == 2
     assert trials["slotfilm"].needs == trials["no_state"].needs
-    assert trials["alpha_5"].needs[0] != trials["slotfilm"].needs[0]
-    assert trials["alpha_5"].needs[1] == trials["slotfilm"].needs[1]
+    assert trials["alpha_5"].needs == trials["slotfilm"].needs
     assert trials["slots_4"].needs[1] != trials["slotfilm"].needs[1]
     assert len(trials["state_only"].needs) == len(trials["cnn"].needs) == 1
     keys = [job.key for job in jobs]
     assert len(set(keys)) == len(keys)
     for job in jobs:
         assert all(keys.index(need) < keys.index(job.key) for need in job.needs)
+
+
+def test_data_of_the_whole_study_are_two_sets_a_seed() -> None:
+    jobs = build_jobs(build_trials(smoke(), select_variants([], []), 3))
+    assert sum(job.kind == "data" for job in jobs) == 6
+
+
+@pytest.mark.parametrize(("section", "values"), [("reward", {"delta_m": 0.05}), ("success", {"require_static": False})])
+def test_data_depend_on_what_decides_success(section: str, values: dict[str, object]) -> None:
+    base = smoke()
+    other = replace(base, **{section: replace(getattr(base, section), **values)})
+    assert build_jobs([other])[0].key != build_jobs([base])[0].key
 
 
 def test_key_depends_on_what_decides_the_result_and_on_nothing_else() -> None:

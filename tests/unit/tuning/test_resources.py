@@ -1,16 +1,24 @@
+import io
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from slotfilm_dist.config import RunConfig
-from slotfilm_dist.presets import paper, smoke
-from slotfilm_dist.tuning.dry_run import describe
+from slotfilm_dist.presets import paper, quick, smoke
+from slotfilm_dist.tuning.dry_run import describe, show
 from slotfilm_dist.tuning.estimate import estimate, total_hours
 from slotfilm_dist.tuning.jobs import Job, build_jobs, build_trials
+from slotfilm_dist.tuning.places import placement_in_group
 from slotfilm_dist.tuning.resources import check_fits, fit_to_resources, job_resources, num_that_fit, runs_on_ray
 
 LAPTOP = [{"CPU": 2.0, "memory": 16e9}]
 HOST = [{"CPU": 64.0, "GPU": 2.0, "memory": 256e9}]
+SPOT = [
+    {"CPU": 64.0, "slotfilm_worker": 1.0, "memory": 256e9},
+    {"CPU": 8.0, "slotfilm_state": 1.0, "memory": 64e9},
+]
 
 
 def job(mode: str = "ray", workers: int = 2, preset: RunConfig | None = None, **runtime: object) -> Job:
@@ -24,17 +32,41 @@ def test_trial_on_ray_has_a_bundle_for_each_role_and_its_memory_in_that_of_the_d
     driver, learner, *others = given.bundles
     assert set(driver) == {"memory"}
     assert learner == {"CPU": 1.0, "GPU": 0.25}
-    assert others == [{"CPU": 1.0}] * 3
+    assert [set(bundle) for bundle in others] == [{"CPU", "memory"}] * 3
     assert given.num_cpus == 4
-    assert driver["memory"] > 4e9
+    assert sum(bundle.get("memory", 0.0) for bundle in given.bundles) == pytest.approx(given.memory_bytes, rel=0.01)
 
 
 def test_nodes_for_workers_and_for_state_are_asked_for_where_there_are_any() -> None:
-    nodes = [{"CPU": 64.0, "slotfilm_worker": 1.0}, {"CPU": 8.0, "slotfilm_state": 1.0}]
-    _, learner, *others = job_resources(job(), nodes).bundles
+    driver, learner, *others = job_resources(job(), SPOT).bundles
     # Hub, learner, central inference and one shard take 0.001 each; two workers may share any bundle.
+    assert driver["slotfilm_state"] == 0.004
     assert learner == {"CPU": 1.0, "slotfilm_state": 0.004}
-    assert others == [{"CPU": 1.0, "slotfilm_worker": 0.002}] * 3
+    assert [bundle["slotfilm_worker"] for bundle in others] == [0.002] * 3
+    assert not [bundle for bundle in others if "slotfilm_state" in bundle]
+    assert not [bundle for bundle in job_resources(job(), HOST).bundles if {*bundle} - {"CPU", "GPU", "memory"}]
+
+
+def test_run_in_one_process_lives_where_state_belongs() -> None:
+    (bundle,) = job_resources(job("local"), SPOT).bundles
+    assert bundle["slotfilm_state"] > 0
+    assert "slotfilm_worker" not in bundle
+
+
+def test_only_nodes_of_the_right_kind_count_for_what_fits() -> None:
+    given = job_resources(job(), SPOT)
+    assert num_that_fit(given, SPOT) == 8  # one core of the eight for state each, 3 of 64 for workers
+    assert num_that_fit(job_resources(job("local"), SPOT), SPOT) == 8
+    few = [{"CPU": 64.0, "slotfilm_state": 1.0, "memory": 64e9}, {"CPU": 1.0, "slotfilm_worker": 1.0, "memory": 64e9}]
+    assert job_resources(job(), few).role_cpus == 0.25  # three roles on the only core for workers
+    small = [SPOT[0], SPOT[1] | {"memory": 1e9}]
+    assert num_that_fit(given, small) == 0
+
+
+def test_learner_waits_for_no_core_where_it_must_live() -> None:
+    on_spot, anywhere = job_resources(job(), SPOT), job_resources(job(), [{"CPU": 64.0}])
+    assert placement_in_group(job().config, on_spot).learner_cpus == 0.0
+    assert placement_in_group(job().config, anywhere).learner_cpus == 1.0
 
 
 def test_central_inference_is_a_role_more() -> None:
@@ -90,6 +122,15 @@ def test_trial_keeps_to_its_cores() -> None:
     assert fit_to_resources(own, job_resources(job(), HOST)).runtime.learner_threads == 3
 
 
+def test_estimate_of_quick_on_ray_with_two_cores_is_within_what_was_measured() -> None:
+    base = quick()
+    config = replace(base, runtime=replace(base.runtime, mode="ray", num_workers=2))
+    jobs = build_jobs(build_trials(config, ["slotfilm"], 1))
+    assert len(jobs) == 3
+    hours = sum(estimate(job, job_resources(job, [{"CPU": 2.0, "memory": 8e9}])).hours for job in jobs)
+    assert 4.0 < 60 * hours < 6.5
+
+
 def test_estimate_grows_with_steps_updates_and_pictures() -> None:
     def hours(config: RunConfig, variant: str = "slotfilm") -> float:
         trial = build_jobs(build_trials(config, [variant], 1))[-1]
@@ -114,6 +155,19 @@ def test_places_are_shared_and_a_trial_waits_for_its_artifacts() -> None:
     trial = jobs[-2]
     assert many >= estimates[trial.key].hours + sum(estimates[key].hours for key in trial.needs)
     assert many < one
+
+
+@pytest.mark.parametrize(("variants", "named"), [(["slotfilm", "no_state", "drq"], ["drq"]), (["slotfilm"], [])])
+def test_dry_run_names_the_few_variants_that_take_most_of_the_hours(variants: list[str], named: list[str]) -> None:
+    base = quick()
+    jobs = build_jobs(build_trials(replace(base, runtime=replace(base.runtime, mode="local")), variants, 2))
+    plan = describe(jobs, jobs, {job.key: job_resources(job, LAPTOP) for job in jobs}, LAPTOP, 0)
+    assert list(plan["hours_by_name"]) == [*named, *(v for v in variants if v not in named)]
+    trials = [row for row in plan["jobs"] if row["kind"] == "trial"]
+    assert sum(plan["hours_by_name"].values()) == pytest.approx(sum(row["hours"] for row in trials))
+    written = io.StringIO()
+    show(plan, Path("grid"), Console(file=written, width=200))
+    assert ("Most of the hours are those of drq (" in written.getvalue()) is bool(named)
 
 
 def test_dry_run_names_what_has_no_room() -> None:
