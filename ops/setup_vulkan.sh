@@ -11,9 +11,9 @@ set -euo pipefail
 . "$(dirname "$0")/apt.sh"
 
 min_mesa="24.3"
-# The driver, and the libraries that SAPIEN's wheel expects of the system.
-packages=(mesa-vulkan-drivers libvulkan1 libegl1 libglvnd0 libx11-6)
-libraries=(libX11.so.6 libEGL.so.1)
+# The driver, and the libraries that the wheels of SAPIEN and OpenCV (of ManiSkill) expect of the system.
+packages=(mesa-vulkan-drivers libvulkan1 libegl1 libglvnd0 libx11-6 libgl1 libglib2.0-0)
+libraries=(libX11.so.6 libEGL.so.1 libGL.so.1 libglib-2.0.so.0)
 
 case "${1:-}" in
   "" | --software) ;;
@@ -45,12 +45,12 @@ if software_driver || { [ "${1:-}" != --software ] && gpu_driver; }; then
 fi
 
 command -v apt-get >/dev/null ||
-  die "install Mesa's lavapipe Vulkan driver, version $min_mesa or newer, and libX11 and libEGL with this system's package manager (the driver is often named mesa-vulkan-drivers or vulkan-swrast), then run this again"
+  die "install Mesa's lavapipe Vulkan driver, version $min_mesa or newer, and libX11, libEGL, libGL and GLib with this system's package manager (the driver is often named mesa-vulkan-drivers or vulkan-swrast), then run this again"
 may_install ||
-  die "SAPIEN needs system packages that this user may not install; run as root: bash $(realpath "$0") ${1:-}"
+  die "the simulator needs system packages that this user may not install; run as root: bash $(realpath "$0") ${1:-}"
 
 if [ "$wanted" = libraries ]; then
-  say "installing the system libraries that SAPIEN needs"
+  say "installing the system libraries that the simulator needs"
   apt_update && apt_install "${packages[@]:1}" || die "apt-get could not install ${packages[*]:1}; see the lines above"
   exit 0
 fi
