@@ -33,8 +33,15 @@ class TrainReport:
 class Backend(Protocol):
     """The roles of one run. Every method that takes long gives control back regularly, so that a run can be stopped."""
 
-    action_dim: int
-    reward_term_names: tuple[str, ...]
+    @property
+    def action_dim(self) -> int:
+        """Size of an action."""
+        ...
+
+    @property
+    def reward_term_names(self) -> tuple[str, ...]:
+        """Names of the reward's components."""
+        ...
 
     def prepare(self) -> None:
         """Find out, before anything is written, whether all that the run needs is there; raises ``ValueError``."""

@@ -27,9 +27,27 @@ class LocalEnv(Protocol):
     num_envs: int
     action_dim: int
     reward_term_names: tuple[str, ...]
-    has_camera: bool
-    episode_steps: int
-    fresh_episodes: bool
+
+    @property
+    def has_camera(self) -> bool:
+        """Whether it gives pictures."""
+        ...
+
+    @property
+    def episode_steps(self) -> int:
+        """Steps after which an episode is truncated."""
+        ...
+
+    @episode_steps.setter
+    def episode_steps(self, steps: int) -> None: ...
+
+    @property
+    def fresh_episodes(self) -> bool:
+        """Whether the simulator is built anew for every episode."""
+        ...
+
+    @fresh_episodes.setter
+    def fresh_episodes(self, fresh: bool) -> None: ...
 
     def reset(self, seeds: Sequence[int]) -> Observation:
         """Start an episode."""

@@ -61,7 +61,8 @@ class StepCheck:
 
 def _sound(observation: Observation) -> Bool[np.ndarray, " envs"]:
     """Which environments' state and goal are finite, and whose picture shows something."""
-    good = np.isfinite(observation.proprio).all(axis=1) & np.isfinite(observation.goal).all(axis=1)
+    finite = [np.all(np.isfinite(values), axis=1) for values in (observation.proprio, observation.goal)]
+    good = np.logical_and(*finite)
     if observation.rgb is not None:
-        good &= observation.rgb.reshape(len(good), -1).any(axis=1)
+        good = good & np.any(observation.rgb.reshape(len(good), -1), axis=1)
     return good

@@ -237,7 +237,7 @@ def _ports(family: Sequence[psutil.Process]) -> set[int]:
     """Ports that a family of processes listens at."""
     members = {process.pid for process in family}
     found = psutil.net_connections("tcp")
-    return {c.laddr.port for c in found if c.pid in members and c.status == psutil.CONN_LISTEN}
+    return {c.laddr.port for c in found if c.pid in members and c.laddr and c.status == psutil.CONN_LISTEN}
 
 
 def _listening(port: int) -> bool:

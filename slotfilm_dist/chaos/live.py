@@ -77,7 +77,7 @@ class MetricsTail:
         complete = fresh[: fresh.rfind(b"\n") + 1]
         self._offset += len(complete)
         for line in complete.splitlines():
-            values = {k: v for k, v in json.loads(line).items() if isinstance(v, int | float)}
+            values = {str(k): float(v) for k, v in json.loads(line).items() if isinstance(v, int | float)}
             self.lines.append(values | {"seen_s": time.monotonic()})
             self.latest |= values
 

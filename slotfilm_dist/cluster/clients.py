@@ -48,7 +48,7 @@ class ActorLink:
         """
         if registered is not None:
             options["name"] = registered
-        remote_class = ray.remote(concurrency_groups=CONCURRENCY[role], **options)(role)
+        remote_class = ray.remote(concurrency_groups=CONCURRENCY[role], **options)(role)  # pyright: ignore[reportCallIssue]
         return cls(remote_class.remote(*arguments, **(keywords or {})), name)
 
     @classmethod

@@ -157,6 +157,7 @@ class Session:
                     ) from error
 
     def _init(self, num_cpus: int, metrics_port: int) -> None:
+        assert self._folder is not None
         ray.init(
             num_cpus=num_cpus,
             object_store_memory=min(STORE_BYTES, usable_memory_bytes() // 4),

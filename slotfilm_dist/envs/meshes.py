@@ -10,13 +10,15 @@ import os
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
 from jaxtyping import Float, UInt8
 from PIL import Image
 from scipy.interpolate import PchipInterpolator
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 ObjectKind = Literal["banana", "bowl"]
 
@@ -92,11 +94,12 @@ def object_files(kind: ObjectKind, cache: Path) -> ObjectFiles:
         shape = _bowl()
     else:
         raise ValueError(f"kind = {kind!r}: must be banana or bowl")
-    contents = {"visual.glb": shape.visual.export(file_type="glb")}
+    contents: dict[str, Any] = {"visual.glb": shape.visual.export(file_type="glb")}
     contents |= {f"piece_{i:02d}.ply": piece.export(file_type="ply") for i, piece in enumerate(shape.pieces)}
     digest = hashlib.sha256()
     for name, content in contents.items():
-        digest.update(f"{name} {len(content)} ".encode() + content)
+        digest.update(f"{name} {len(content)} ".encode())
+        digest.update(content)
     folder = cache / f"{kind}-{digest.hexdigest()[:16]}"
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in contents.items():
@@ -133,11 +136,11 @@ def _banana() -> _Shape:
     rings = _banana_rings(visual_s, num_around=20)
     rings[[0, -1]] = rings[[0, -1]].mean(axis=1, keepdims=True)
     u, v = np.meshgrid(visual_s / BANANA_LENGTH_M, np.linspace(0, 1, rings.shape[1]), indexing="ij")
-    skin = trimesh.visual.material.PBRMaterial(
+    skin = PBRMaterial(
         baseColorTexture=Image.fromarray(_banana_skin()), metallicFactor=0.0, roughnessFactor=0.75
     )
     visual = _grid_mesh(rings)
-    visual.visual = trimesh.visual.TextureVisuals(uv=np.stack([u, v], axis=-1).reshape(-1, 2), material=skin)
+    visual.visual = TextureVisuals(uv=np.stack([u, v], axis=-1).reshape(-1, 2), material=skin)
     cuts = _banana_rings(BANANA_LENGTH_M * np.array([0, 0.14, 0.27, 0.4, 0.52, 0.65, 0.8, 1.0]), num_around=20)
     pieces = tuple(_hull(cuts[i : i + 2]) for i in range(len(cuts) - 1))
     return _Shape(visual=visual, pieces=pieces, mass_kg=0.066, friction=1.0)
@@ -182,10 +185,10 @@ def _banana_skin() -> UInt8[np.ndarray, "64 256 3"]:
 def _bowl() -> _Shape:
     """A round bowl with a flat foot, open at the top; mass of the YCB set's 024_bowl."""
     visual = _grid_mesh(_turned(_bowl_profile(9), num_around=48))
-    red = trimesh.visual.material.PBRMaterial(
+    red = PBRMaterial(
         baseColorFactor=_BOWL_RGBA, metallicFactor=0.0, roughnessFactor=0.5, doubleSided=False
     )
-    visual.visual = trimesh.visual.TextureVisuals(material=red)
+    visual.visual = TextureVisuals(material=red)
     outer, inner = _bowl_wall(np.deg2rad([0, 50, 90]))
     pieces = []
     for band in range(2):

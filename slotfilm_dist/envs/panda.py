@@ -6,6 +6,7 @@ through ManiSkill unchanged.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 import sapien
@@ -50,7 +51,7 @@ class SlotfilmPanda(PandaWristCam):
             super().before_simulation_step()
 
     def _command_arm(self, command: np.ndarray) -> None:
-        arm = self.controller.controllers["arm"]
+        arm = self._part("arm")
         config, kinematics = arm.config, arm.kinematics
         low, high = config.pos_lower, config.pos_upper
         position = np.clip(command[:3], -1, 1) * (high - low) / 2 + (high + low) / 2
@@ -70,7 +71,7 @@ class SlotfilmPanda(PandaWristCam):
             joint.set_drive_target(float(value))
 
     def _command_gripper(self, command: float) -> None:
-        config = self.controller.controllers["gripper"].config
+        config = self._part("gripper").config
         low, high = config.lower, config.upper
         target = min(max(command, -1.0), 1.0) * (high - low) / 2 + (high + low) / 2
         for joint in self._finger_joints:
@@ -82,6 +83,11 @@ class SlotfilmPanda(PandaWristCam):
         self._arm_joints = [joints[name] for name in self.arm_joint_names]
         self._finger_joints = [joints[name] for name in self.gripper_joint_names]
 
+    def _part(self, name: str) -> Any:
+        """The controller of the arm or of the gripper, of the combined one that this control mode has."""
+        combined: Any = self.controller
+        return combined.controllers[name]
+
     @property
     def _ik_mask(self) -> np.ndarray:
-        return self.controller.controllers["arm"].kinematics.qmask.numpy()
+        return self._part("arm").kinematics.qmask.numpy()

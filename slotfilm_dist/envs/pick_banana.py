@@ -58,9 +58,9 @@ class PickBananaEnv(BaseEnv):
         mesh_cache: folder for the generated meshes.
     """
 
-    SUPPORTED_ROBOTS: ClassVar[list[str]] = ["panda_wristcam_direct", "panda_wristcam"]
+    SUPPORTED_ROBOTS = ["panda_wristcam_direct", "panda_wristcam"]  # noqa: RUF012  declared by the base class
     SUPPORTED_REWARD_MODES: ClassVar[list[str]] = ["dense", "normalized_dense", "sparse", "none"]
-    agent: SlotfilmPanda
+    agent: SlotfilmPanda  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(
         self,
@@ -89,7 +89,7 @@ class PickBananaEnv(BaseEnv):
         pose = sapien_utils.look_at([0.55, 0.55, 0.5], [-0.05, 0.0, 0.1])
         return CameraConfig("render_camera", pose, 512, 512, 1, 0.01, 100)
 
-    def _load_agent(self, options: dict) -> None:
+    def _load_agent(self, options: dict) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         super()._load_agent(options, sapien.Pose(p=[ROBOT_BASE_X_M, 0, 0]))
 
     def _load_scene(self, options: dict) -> None:
@@ -119,7 +119,7 @@ class PickBananaEnv(BaseEnv):
         for path in files.collisions:
             builder.add_convex_collision_from_file(str(path), material=material, density=files.density_kg_m3)
         builder.add_visual_from_file(str(files.visual))
-        builder.initial_pose = pose
+        builder.set_initial_pose(pose)
         return builder.build(name=kind), files.rest_height_m
 
     def _build_ycb(self, kind: str, pose: sapien.Pose) -> tuple[Any, float]:
@@ -130,9 +130,11 @@ class PickBananaEnv(BaseEnv):
                 "run `python -m mani_skill.utils.download_asset ycb`, or use env.assets = 'procedural'"
             )
         builder = actors.get_actor_builder(self.scene, id=f"ycb:{model}")
-        builder.initial_pose = pose
+        builder.set_initial_pose(pose)
         actor = builder.build(name=kind)
-        return actor, float(-actor.get_first_collision_mesh().bounding_box.bounds[0, 2])
+        mesh = actor.get_first_collision_mesh()
+        assert mesh is not None, "YCB models have collision meshes"
+        return actor, float(-mesh.bounding_box.bounds[0, 2])
 
     def _after_reconfigure(self, options: dict) -> None:
         self.reader = SceneReader(self, ("banana", "bowl"), "goal_site")
@@ -142,7 +144,7 @@ class PickBananaEnv(BaseEnv):
             count = len(env_idx)
             self._state = None
             self.table_scene.table.set_pose(
-                sapien.Pose(p=[-0.12, 0, -self.table_scene.table_height], q=euler2quat(0, 0, np.pi / 2))
+                sapien.Pose(p=[-0.12, 0, -self.table_scene.table_height], q=euler2quat(0, 0, np.pi / 2).tolist())
             )
             banana, bowl, goal = self._draw_layout(count)
             self.banana.set_pose(Pose.create_from_pq(p=banana, q=_yaw(_uniform(count, -np.pi, np.pi))))

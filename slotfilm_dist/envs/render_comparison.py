@@ -115,16 +115,18 @@ class _Studio:
 
     def photograph(self, prepare: Callable[[], None]) -> _Picture:
         """The second of two pictures, so that a change of the scene before them is not timed."""
-        wall_s = 0.0
-        for _ in range(2):
-            start = time.perf_counter()
-            prepare()
-            self._scene.update_render()
-            self._camera.take_picture()
-            colour = self._camera.get_picture("Color")
-            wall_s = time.perf_counter() - start
+        self._take(prepare)
+        start = time.perf_counter()
+        colour = self._take(prepare)
+        wall_s = time.perf_counter() - start
         label = self._camera.get_picture("PositionSegmentation")[..., 3]
         return _Picture(colour=colour[..., :3].astype(np.int64), label=label.astype(np.int64), wall_s=wall_s)
+
+    def _take(self, prepare: Callable[[], None]) -> np.ndarray:
+        prepare()
+        self._scene.update_render()
+        self._camera.take_picture()
+        return self._camera.get_picture("Color")
 
 
 def _compare(whole: _Studio, slim: _Studio, num_poses: int, rng: np.random.Generator) -> ProfileComparison:

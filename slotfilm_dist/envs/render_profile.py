@@ -101,7 +101,7 @@ class _View:
         x, y, z = np.moveaxis(points, -1, 0)
         reach_y, reach_z = x * self.tan_y + _MARGIN_M, x * self.tan_z + _MARGIN_M
         sides = np.stack([x < self.near_m - _MARGIN_M, y > reach_y, y < -reach_y, z > reach_z, z < -reach_z])
-        return sides.all(axis=-1).any(axis=0)
+        return np.any(sides.all(axis=-1), axis=0)
 
     def reaches(self, to_world: Float[np.ndarray, "4 4"], height_m: float, distance_m: float) -> bool:
         """Whether some ray of the picture meets the plane at a height beyond a square about the origin, or never."""

@@ -66,8 +66,8 @@ class ToyEnv:
         terminated = success & self._config.env.terminate_on_success
         truncated = (self._elapsed >= self.episode_steps) & ~terminated
         final = self._observe()
-        for i in np.flatnonzero(terminated | truncated):
-            self._restart(int(i), next_seeds[i])
+        for i in np.flatnonzero(terminated | truncated).tolist():
+            self._restart(i, next_seeds[i])
         return StepResult(
             observation=self._observe(),
             final=final,

@@ -3,7 +3,7 @@
 The one place where simulator values become `Observation`s and `StepResult`s.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -46,11 +46,13 @@ class WristEnv:
         if own:
             kwargs |= {"task_config": config.env, "reward_config": config.reward, "success_config": config.success}
         backend = "none"
+        self._make_camera: Callable[[], Any] = lambda: None
         if camera:
             from slotfilm_dist.envs.camera import WristCamera, render_device
 
             kwargs |= {"sensor_configs": WristCamera.sensor_configs(config.env)}
             backend = render_device(config.env.render_backend)
+            self._make_camera = lambda: WristCamera(self._env, config.env)
         try:
             self._env: Any = gym.make(
                 self._task.env_id,
@@ -70,7 +72,6 @@ class WristEnv:
             raise ValueError(_cannot_build(config, str(error), camera=camera)) from error
         self.action_dim = int(self._env.single_action_space.shape[0])
         self.reward_term_names: tuple[str, ...] = TERMS if own else ("reward",)
-        self._make_camera = (lambda: WristCamera(self._env, config.env)) if camera else (lambda: None)
         self._attach()
         self._elapsed = np.zeros(num_envs, np.int64)
         self.episode_steps = config.env.max_steps
@@ -153,7 +154,7 @@ class WristEnv:
         if self.fresh_episodes and len(indices) == self.num_envs:
             return self.reset(next_seeds)
         self._env.reset(
-            seed=[int(next_seeds[i]) for i in indices],
+            seed=[int(next_seeds[i]) for i in indices.tolist()],
             options={"env_idx": torch.as_tensor(indices, device=self._env.device)},
         )
         self._elapsed[indices] = 0

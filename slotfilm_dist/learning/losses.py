@@ -64,4 +64,4 @@ def temperature_loss(
 @torch.no_grad()
 def polyak(target: list[Tensor], online: list[Tensor], tau: float) -> None:
     """target = tau online + (1 - tau) target, in place (Equation 9)."""
-    torch._foreach_lerp_(target, online, tau)
+    torch._foreach_lerp_(target, online, tau)  # pyright: ignore[reportPrivateImportUsage]

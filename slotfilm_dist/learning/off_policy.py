@@ -174,7 +174,8 @@ def gradient_norm(parameters: Iterable[torch.nn.Parameter]) -> Float[Tensor, ""]
     gradients = [p.grad for p in parameters if p.grad is not None]
     if not gradients:
         return torch.zeros(())
-    return torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
+    norms = torch._foreach_norm(gradients)  # pyright: ignore[reportPrivateImportUsage]
+    return torch.linalg.vector_norm(torch.stack(norms))
 
 
 def _load_module(module: torch.nn.Module, name: str, tensors: Mapping[str, Tensor]) -> None:
