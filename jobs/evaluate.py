@@ -6,7 +6,8 @@
 `/shared` stands for a directory that every node sees. Further words, after the runs, go to `slotfilm evaluate`. It
 works in the job's own process, hence the one core that it asks for.
 
-Submitted again it goes on: runs whose evaluation is there are left alone. `ray job stop` ends it within an episode.
+Submitted again it goes on: runs whose evaluation is there are left alone, unless further words may ask for another one.
+`ray job stop` ends it within an episode.
 """
 
 import argparse
@@ -14,6 +15,9 @@ import sys
 from pathlib import Path
 
 from slotfilm_dist.__main__ import main
+
+STOPPED = 128
+"""Exit codes from here on mean that a signal has ended it."""
 
 
 def is_there(run: Path, episodes: int, seed: int) -> bool:
@@ -36,5 +40,8 @@ if __name__ == "__main__":
             continue
         print(f"{run}:", flush=True)
         words = [str(run), "--episodes", str(options.episodes), "--seed", str(options.seed), *rest]
-        code = main(["evaluate", *words]) or code
+        ended = main(["evaluate", *words])
+        if ended >= STOPPED:
+            sys.exit(ended)
+        code = ended or code
     sys.exit(code)

@@ -14,6 +14,9 @@ import sys
 from slotfilm_dist.__main__ import main
 
 if __name__ == "__main__":
+    if sys.argv[1:] in (["-h"], ["--help"]):
+        print(__doc__)
+        sys.exit(0)
     if len(sys.argv) < 2 or sys.argv[1].startswith("-"):
         sys.exit("usage: python jobs/seeds.py VARIANT [PRESET] [--seeds N] [options of slotfilm grid]")
     sys.exit(main(["grid", *sys.argv[2:], "--only", sys.argv[1]]))
