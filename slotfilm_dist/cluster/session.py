@@ -1,6 +1,7 @@
 """Joins the Ray cluster that is there, or starts a private one on this machine."""
 
 import contextlib
+import functools
 import json
 import logging
 import os
@@ -139,7 +140,7 @@ class Session:
         if not os.environ.get("RAY_AUTH_MODE"):
             token = self._folder / "token"
             token.touch(mode=0o600)
-            token.write_text(secrets.token_hex(32))
+            token.write_text(_own_token())
             self._set("RAY_AUTH_TOKEN_PATH", str(token))
             self._environment.setdefault("RAY_AUTH_MODE", None)  # Ray turns it on by itself where a token is there
         for attempt in range(START_ATTEMPTS):
@@ -178,6 +179,12 @@ class Session:
     @staticmethod
     def _environment_now(name: str) -> str:
         return os.environ.get(name, "")
+
+
+@functools.cache
+def _own_token() -> str:
+    """One for all private clusters of this process: Ray reads a token once and keeps it as long as the process lives."""
+    return secrets.token_hex(32)
 
 
 def free_port(first: int) -> int:

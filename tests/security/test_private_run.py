@@ -147,3 +147,20 @@ def test_processes_show_no_token_in_their_command_line(run: PrivateRun) -> None:
                 continue
     assert b"gcs_server" in lines
     assert run.token.encode() not in lines
+
+
+def test_process_can_start_one_private_cluster_after_another() -> None:
+    """Ray keeps the first cluster's token as long as the process lives."""
+    program = (
+        "from slotfilm_dist.cluster.session import Session\n"
+        "for _ in range(2):\n"
+        "    session = Session(num_cpus=1)\n"
+        "    print(len(session.nodes()), flush=True)\n"
+        "    session.close()\n"
+    )
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+    child = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=START_S
+    )
+    assert child.returncode == 0, child.stderr[-3000:]
+    assert child.stdout.split() == ["1", "1"]
