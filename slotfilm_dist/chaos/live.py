@@ -158,9 +158,11 @@ class LiveRun:
         wanted = self.value("updates") + count
         return self.until(lambda m: m["updates"] >= wanted, f"{count} more updates", timeout_s)
 
-    def kill(self, role: str) -> None:
-        """End a role's process with SIGKILL."""
-        os.kill(self.backend.process_ids()[role], signal.SIGKILL)
+    def kill(self, *roles: str) -> None:
+        """End roles' processes with SIGKILL, one right after the other."""
+        ids = self.backend.process_ids()  # asked for once: a killed one does not answer
+        for role in roles:
+            os.kill(ids[role], signal.SIGKILL)
 
     def longest_pause_s(self, since_s: float) -> float:
         """The longest time between two reports that show progress of the learner, from `since_s` on."""

@@ -94,9 +94,9 @@ def all_shards_killed(run: LiveRun, rng: np.random.Generator) -> Observation:
     count, needed = run.config.replay.num_shards, run.config.replay.min_steps
     restarts = run.value("replay_restarts_total/crash")
     began = time.monotonic()
-    for index in rng.permutation(count):
+    for index in range(count):
         shutil.rmtree(run.checkpoints / "replay" / f"shard-{index:02d}", ignore_errors=True)
-        run.kill(f"shard {index}")
+    run.kill(*(f"shard {index}" for index in rng.permutation(count)))
     run.until(lambda m: m["replay_restarts_total/crash"] == restarts + count, "new shards", 120)
     run.until(lambda m: m["replay_shards_alive_count"] == count, "their answers", 120)
     run.more_updates(20, 120)

@@ -183,7 +183,7 @@ class Session:
 
 @functools.cache
 def _own_token() -> str:
-    """One for all private clusters of this process: Ray reads a token once and keeps it as long as the process lives."""
+    """One for all private clusters of this process: Ray reads a token once and keeps it while the process lives."""
     return secrets.token_hex(32)
 
 

@@ -136,9 +136,7 @@ def _banana() -> _Shape:
     rings = _banana_rings(visual_s, num_around=20)
     rings[[0, -1]] = rings[[0, -1]].mean(axis=1, keepdims=True)
     u, v = np.meshgrid(visual_s / BANANA_LENGTH_M, np.linspace(0, 1, rings.shape[1]), indexing="ij")
-    skin = PBRMaterial(
-        baseColorTexture=Image.fromarray(_banana_skin()), metallicFactor=0.0, roughnessFactor=0.75
-    )
+    skin = PBRMaterial(baseColorTexture=Image.fromarray(_banana_skin()), metallicFactor=0.0, roughnessFactor=0.75)
     visual = _grid_mesh(rings)
     visual.visual = TextureVisuals(uv=np.stack([u, v], axis=-1).reshape(-1, 2), material=skin)
     cuts = _banana_rings(BANANA_LENGTH_M * np.array([0, 0.14, 0.27, 0.4, 0.52, 0.65, 0.8, 1.0]), num_around=20)
@@ -185,9 +183,7 @@ def _banana_skin() -> UInt8[np.ndarray, "64 256 3"]:
 def _bowl() -> _Shape:
     """A round bowl with a flat foot, open at the top; mass of the YCB set's 024_bowl."""
     visual = _grid_mesh(_turned(_bowl_profile(9), num_around=48))
-    red = PBRMaterial(
-        baseColorFactor=_BOWL_RGBA, metallicFactor=0.0, roughnessFactor=0.5, doubleSided=False
-    )
+    red = PBRMaterial(baseColorFactor=_BOWL_RGBA, metallicFactor=0.0, roughnessFactor=0.5, doubleSided=False)
     visual.visual = TextureVisuals(material=red)
     outer, inner = _bowl_wall(np.deg2rad([0, 50, 90]))
     pieces = []
