@@ -14,7 +14,6 @@ from slotfilm_dist.learning.learner import Learner
 from slotfilm_dist.learning.off_policy import TrainingDivergedError
 from slotfilm_dist.learning.recovery import Recovery
 from slotfilm_dist.messages import SampleBatch, TransitionBlock, WeightSnapshot
-from slotfilm_dist.replay.sharded import EmptyReplayError
 
 ADMIT_S = 0.5
 """Longest wait of one request for updates; what is due by then is granted."""
@@ -187,8 +186,6 @@ class LearningLoops:
                 self.waiting_for = f"replay to hold {wanted} steps; it holds {stored}"
             except (RoleLostError, RoleSilentError) as error:
                 self.waiting_for = str(error)
-            except EmptyReplayError:  # the shards were lost since they were counted
-                self.waiting_for = f"replay to hold {wanted} steps; it holds none"
             self._stopping.wait(RETRY_S)
         return []
 

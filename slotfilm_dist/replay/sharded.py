@@ -15,10 +15,6 @@ from slotfilm_dist.replay.ledger import shard_of
 from slotfilm_dist.replay.shard import ReplayShard, generator_from
 
 
-class EmptyReplayError(ValueError):
-    """Nothing is stored to draw from."""
-
-
 def split_draws(
     rng: np.random.Generator, num_steps: Sequence[int], num_batches: int, batch_size: int
 ) -> Int64[np.ndarray, "batches shards"]:
@@ -31,11 +27,11 @@ def split_draws(
         batch_size: steps of each.
 
     Raises:
-        EmptyReplayError: nothing is stored anywhere.
+        ValueError: nothing is stored anywhere.
     """
     stored = np.asarray(num_steps, np.float64)
     if stored.sum() == 0:
-        raise EmptyReplayError("replay is empty: insert a block before sampling")
+        raise ValueError("replay is empty: insert a block before sampling")
     return rng.multinomial(batch_size, stored / stored.sum(), size=num_batches)
 
 
