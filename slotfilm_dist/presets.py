@@ -13,7 +13,7 @@ def paper() -> RunConfig:
 
 
 def steady() -> RunConfig:
-    """The paper's lengths with what was measured to learn reliably: see `ops/results/learning.md`.
+    """The paper's lengths, with the values by which `oracle_state` came to solve the task (`ops/results/learning.md`).
 
     The reward is smooth up to the target and pays for standing still from a few rad/s down, the discount is short, and
     the temperature falls from exploring to standing still. Ablations of the reward as printed belong to `paper`.
