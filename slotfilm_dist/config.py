@@ -318,6 +318,8 @@ class PretrainConfig:
     """Position errors in [0, 1] image units, or in pixels."""
     train_backbone: Literal["all", "none"] = "all"
     """Train the whole ResNet, as the paper does, or keep it as initialised and learn on its cached features."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Arithmetic of backbone and projection while they are trained; losses and weights are float32 in both."""
     holdout: float = 0.1
     """Share of the episodes' frames held out for the reported errors."""
     eval_every: int = 500
@@ -535,6 +537,8 @@ class RuntimeConfig:
     """Most workers that `auto_workers` asks for; 0 is as many as the cluster has cores."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device of the learner; `auto` takes a GPU where there is one."""
+    cuda_graphs: bool = True
+    """On a GPU, record updates, pre-training steps and central inference as CUDA graphs: several times faster."""
     inference: Literal["auto", "worker", "central"] = "auto"
     """Who turns pictures into actions (`ray` mode): every worker for itself, or one process for all workers, in
     batches; `auto` is central where that process gets a GPU and the agent has a camera."""

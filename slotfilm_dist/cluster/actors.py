@@ -168,7 +168,9 @@ class InferenceActor:
         torch.set_num_threads(config.runtime.worker_threads)
         device = torch.device("cuda" if gpu else "cpu")
         policy = build_policy(config, hub.agent_setup(), role_seed(config.seed, Role.ACTIONS), device=device)
-        self._server = InferenceServer(policy, hub, max_staleness_s=config.runtime.max_staleness_s)
+        self._server = InferenceServer(
+            policy, hub, max_staleness_s=config.runtime.max_staleness_s, cuda_graphs=config.runtime.cuda_graphs
+        )
         self._sink = FanOut([RaySink(labels, "central")] if labels else [])
 
     @ray.method(concurrency_group="requests")

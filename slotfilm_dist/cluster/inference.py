@@ -5,7 +5,7 @@ import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from dataclasses import dataclass, field
@@ -16,6 +16,7 @@ import torch
 from slotfilm_dist.cluster.acting import WeightFollower, WeightLink
 from slotfilm_dist.cluster.failures import RoleSilentError
 from slotfilm_dist.cluster.messages import InferenceAnswer, InferenceRequest, InferenceStatus
+from slotfilm_dist.nets.capture import SizedCaptures
 from slotfilm_dist.policy import AgentPolicy
 
 DEADLINE_S = 0.005
@@ -50,6 +51,7 @@ class InferenceServer:
         deadline_s: longest wait of a request for others.
         max_batch: observations computed at once.
         max_staleness_s: see `WeightFollower`.
+        cuda_graphs: on a GPU, record the passes.
     """
 
     def __init__(
@@ -60,6 +62,7 @@ class InferenceServer:
         deadline_s: float = DEADLINE_S,
         max_batch: int = MAX_BATCH_STEPS,
         max_staleness_s: float = math.inf,
+        cuda_graphs: bool = True,
     ) -> None:
         self._policy = policy
         self._device = next(policy.actor.parameters()).device
@@ -72,6 +75,8 @@ class InferenceServer:
         self._num_requests = self._num_steps = self._num_batches = 0
         self._busy_s = 0.0
         self._starts = uuid.uuid4().hex
+        graphed = cuda_graphs and self._device.type == "cuda"
+        self._run_batch = SizedCaptures(self._see_and_act, self._device) if graphed else self._run_plainly
         threading.Thread(target=self._run, name="inference", daemon=True).start()
 
     def infer(self, request: InferenceRequest) -> InferenceAnswer:
@@ -160,24 +165,17 @@ class InferenceServer:
         late = now - self._pending[0].arrived_at >= self._deadline_s
         return late or num_steps >= self._max_batch or asking >= self._active.keys()
 
-    @torch.inference_mode()
     def _compute(self, requests: Sequence[InferenceRequest]) -> list[InferenceAnswer]:
         """One pass through encoder and actor, cut into the requests' answers."""
         policy, first = self._policy, requests[0]
-        proprio, goal, noise = (
-            self._tensor([getattr(r, name) for r in requests]) for name in ("proprio", "goal", "noise")
-        )
+        told = "visual" if first.visual is not None else "rgb" if first.rgb is not None else None
+        names = ("proprio", "goal", "noise") + ((told,) if told else ())
+        arrays = {name: np.concatenate([getattr(r, name) for r in requests]) for name in names}
         with self._follower.steady:
-            if first.visual is not None:
-                visual = self._tensor([r.visual for r in requests if r.visual is not None])
-            elif first.rgb is not None:
-                visual = policy.encoder.to_visual(self._tensor([r.rgb for r in requests if r.rgb is not None]))
-            else:
-                visual = torch.empty((len(proprio), 0), dtype=torch.uint8, device=self._device)
-            action = policy.actor.explore(policy.encoder(visual, proprio, goal), noise).cpu().numpy()
+            action, visual = self._run_batch(arrays)
             version = self._follower.version
         # Pictures are kept where they are, only tokens have to be told.
-        tokens = visual.cpu().numpy() if policy.encoder.visual_kind == "tokens" and first.visual is None else None
+        tokens = visual if policy.encoder.visual_kind == "tokens" and told == "rgb" else None
         ends = np.cumsum([len(r.proprio) for r in requests])
         return [
             InferenceAnswer(
@@ -189,9 +187,21 @@ class InferenceServer:
             for r, end in zip(requests, ends, strict=True)
         ]
 
-    def _tensor(self, parts: Sequence[np.ndarray]) -> torch.Tensor:
-        # A copy: what came in a message is read-only.
-        return torch.from_numpy(np.concatenate(parts)).to(self._device)
+    @torch.no_grad()
+    def _see_and_act(self, batch: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Actions, and what the encoder makes of the pictures."""
+        policy, proprio = self._policy, batch["proprio"]
+        if "visual" in batch:
+            visual = batch["visual"]
+        elif "rgb" in batch:
+            visual = policy.encoder.to_visual(batch["rgb"])
+        else:
+            visual = torch.empty((len(proprio), 0), dtype=torch.uint8, device=self._device)
+        return policy.actor.explore(policy.encoder(visual, proprio, batch["goal"]), batch["noise"]), visual
+
+    def _run_plainly(self, arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
+        tensors = {name: torch.from_numpy(array).to(self._device) for name, array in arrays.items()}
+        return tuple(result.cpu().numpy() for result in self._see_and_act(tensors))
 
 
 def _fits(request: InferenceRequest, first: InferenceRequest) -> bool:

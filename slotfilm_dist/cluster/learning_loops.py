@@ -126,6 +126,7 @@ class LearningLoops:
         self._stopping = threading.Event()
         self._ready: queue.Queue[list[SampleBatch]] = queue.Queue(1)
         self._granted = self._made = 0
+        self._counted = learner.updates
         self.waiting_for = self.error = ""
         self.waited_s = self.batch_wait_s = self.update_s = 0.0
         self._threads = [
@@ -150,6 +151,8 @@ class LearningLoops:
             thread.join(max(0.0, deadline - time.monotonic()))
             if thread.is_alive():
                 raise RoleSilentError("learner", f"its thread {thread.name} to end", timeout_s)
+        self._learner.settle()
+        self._count()
         self._hub.refund_updates(self._granted - self._made)
         self._granted = self._made
         self._publisher.publish()
@@ -222,20 +225,26 @@ class LearningLoops:
         """Make an update; True if it took the learner back to a checkpoint."""
         began = time.monotonic()
         with self._state:
-            before = self._learner.updates
             try:
                 self._learner.update(batch)
             except TrainingDivergedError as error:
                 lost = self._recovery.roll_back(error)
+                self._counted = self._learner.updates
                 self._give_back(made=lost, granted=1)
                 self._publisher.start_over()
                 return True
-            made = self._learner.updates - before
-        self._made += made
-        if not made:  # skipped for a loss or gradient that was not finite: it is due again
-            self._give_back(made=0, granted=1)
+            made = self._count()
+        if made < 1:  # some were skipped for a loss or gradient that was not finite: they are due again
+            self._give_back(made=0, granted=1 - made)
         self.update_s = time.monotonic() - began
         return False
+
+    def _count(self) -> int:
+        """Updates made since the last call; fewer than none where earlier ones turn out to have been skipped."""
+        made = self._learner.updates - self._counted
+        self._counted += made
+        self._made += made
+        return made
 
     def _give_back(self, *, made: int, granted: int) -> None:
         """Updates that are due again: some that were made and are lost, some that were granted and not made."""

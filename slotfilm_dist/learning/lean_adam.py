@@ -1,10 +1,26 @@
 """Adam with torch's fused kernel and next to nothing around it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
+
+
+PIECE = 8192
+"""Elements of a piece, see `pieces`."""
+
+
+def pieces(tensors: Iterable[Tensor]) -> list[Tensor]:
+    """The same numbers, flat and cut up, for the kernels that take many tensors at once.
+
+    On a GPU they give 65,536 elements of a tensor to one block of threads, so that a whole layer waits for one. Tensors
+    that are not contiguous stay whole.
+    """
+    cut: list[Tensor] = []
+    for tensor in tensors:
+        cut += tensor.detach().view(-1).split(PIECE) if tensor.is_contiguous() else [tensor.detach()]
+    return cut
 
 
 class LeanAdam(torch.optim.Adam):
@@ -14,8 +30,12 @@ class LeanAdam(torch.optim.Adam):
     lists are kept and the parameters of a group share one count. State and checkpoints are torch's.
     """
 
+    found_inf: Tensor | None
+    """1 where the next step is to change nothing, else 0; None never asks. A name that torch's own step looks for."""
+
     def __init__(self, groups: list[dict[str, Any]]) -> None:
         super().__init__(groups, fused=True)
+        self.found_inf = None
         self._lists: list[tuple[list[Tensor], ...]] | None = None
 
     @torch.no_grad()
@@ -28,10 +48,17 @@ class LeanAdam(torch.optim.Adam):
             super().step()
             return
         assert self._lists is not None
+        if gradients[0][0].is_cuda:
+            gradients = [
+                pieces(
+                    g.contiguous() if p.is_contiguous() else g for p, g in zip(group["params"], of_group, strict=True)
+                )
+                for group, of_group in zip(self.param_groups, gradients, strict=True)
+            ]
         for group, grads, (parameters, first, second, steps) in zip(
             self.param_groups, gradients, self._lists, strict=True
         ):
-            steps[0] += 1
+            steps[0] += 1 if self.found_inf is None else 1 - self.found_inf
             torch._fused_adam_(  # type: ignore[reportPrivateImportUsage]  # what torch's own fused Adam calls
                 parameters,
                 grads,
@@ -46,6 +73,7 @@ class LeanAdam(torch.optim.Adam):
                 eps=group["eps"],
                 amsgrad=False,
                 maximize=False,
+                found_inf=self.found_inf,
             )
 
     def zero_grad(self, set_to_none: bool = True) -> None:
@@ -57,8 +85,9 @@ class LeanAdam(torch.optim.Adam):
 
     def state_dict(self) -> dict[str, Any]:
         """The state in torch's own form, every count a tensor of its own."""
-        self._count_apart()
-        return super().state_dict()
+        state = super().state_dict()
+        of_parameters = {i: {**moments, "step": moments["step"].clone()} for i, moments in state["state"].items()}
+        return {**state, "state": of_parameters}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:  # type: ignore[override]  # torch's own alias
         """Continue from torch's own form of the state."""
@@ -83,7 +112,9 @@ class LeanAdam(torch.optim.Adam):
             count = states[0]["step"]
             for state in states:
                 state["step"] = count
-            moments = ([s[key] for s in states] for key in ("exp_avg", "exp_avg_sq"))
-            lists.append((list(group["params"]), *moments, [count] * len(states)))
+            columns = [list(group["params"]), *([s[key] for s in states] for key in ("exp_avg", "exp_avg_sq"))]
+            if count.is_cuda:
+                columns = [pieces(column) for column in columns]
+            lists.append((*columns, [count] * len(columns[0])))
         self._lists = lists
         return True

@@ -28,6 +28,7 @@ from slotfilm_dist.envs.reward import rewards_of
 from slotfilm_dist.learning.checkpoint import Checkpoint, plain_tensors
 from slotfilm_dist.learning.ddpg import DdpgLearner
 from slotfilm_dist.learning.frames import PretrainFrames
+from slotfilm_dist.learning.graphed_sac import GraphedSac
 from slotfilm_dist.learning.pretrain import Pretrainer
 from slotfilm_dist.learning.sac import SacLearner
 from slotfilm_dist.messages import SampleBatch, TransitionBlock, WeightSnapshot
@@ -43,6 +44,8 @@ RlLearner = SacLearner | DdpgLearner
 
 SMALLEST_STD = 1e-2
 """Least deviation that the state is divided by: a field that barely moves at random may matter later."""
+LOSSES_EVERY = 10
+"""Pre-training steps between readings of the losses, for each of which the learner waits for the GPU."""
 ENCODE_ROWS = 256
 """Rows of random-policy data encoded at once."""
 STATE_ROWS = 200_000
@@ -116,6 +119,7 @@ class Learner:
             self.config.pretrain,
             seed=role_number(self.config.seed, Role.PRETRAIN),
             device=self.device,
+            cuda_graphs=self.config.runtime.cuda_graphs,
         )
 
     def pretrain(self, num_steps: int) -> dict[str, float]:
@@ -126,7 +130,9 @@ class Learner:
         started = time.monotonic()
         last = min(trainer.num_steps + num_steps, config.steps)
         while trainer.num_steps < last:
-            metrics |= trainer.step()
+            trainer.begin_step()
+            if trainer.num_steps % LOSSES_EVERY == 0 or trainer.num_steps == last:
+                metrics |= trainer.losses()
             if trainer.num_steps % config.eval_every == 0 or trainer.num_steps == config.steps:
                 metrics |= trainer.evaluate().metrics()
         metrics["pretrain_steps_total"] = trainer.num_steps
@@ -211,6 +217,10 @@ class Learner:
         """One update of every network."""
         self.rl.update(batch)
 
+    def settle(self) -> None:
+        """Wait for updates under way; `updates` may fall by those that were skipped."""
+        self.rl.settle()
+
     def metrics(self) -> dict[str, float]:
         """The latest measurements of RL."""
         return self.rl.metrics()
@@ -249,7 +259,8 @@ def build_rl(config: RunConfig, encoder: AgentEncoder, action_dim: int, device: 
     if config.algorithm == "ddpg":
         assert isinstance(encoder, PixelEncoder), "the config allows DrQ-v2's encoder only"
         return DdpgLearner(config, encoder, action_dim, seed, device)
-    return SacLearner(config, encoder, action_dim, seed, device)
+    graphed = device.type == "cuda" and encoder.visual_kind != "rgb" and config.runtime.cuda_graphs
+    return (GraphedSac if graphed else SacLearner)(config, encoder, action_dim, seed, device)
 
 
 def replay_schema(config: RunConfig, encoder: Encoder, action_dim: int) -> ReplaySchema:

@@ -69,6 +69,9 @@ class OffPolicyLearner(abc.ABC, Generic[ActorT]):
         """Learned tensors that belong to no network, for checkpoints."""
         return {}
 
+    def settle(self) -> None:  # noqa: B027  # nothing to wait for where every update looks at its own losses
+        """Wait for updates under way, after which `updates` counts those that were made."""
+
     def metrics(self) -> dict[str, float]:
         """The latest measurements, by the metric catalogue's names."""
         values = {name: float(value) for name, value in self._metrics.items()}
@@ -169,7 +172,7 @@ class OffPolicyLearner(abc.ABC, Generic[ActorT]):
             return torch.from_numpy(array).to(self.device, non_blocking=True)
 
 
-def gradient_norm(parameters: Iterable[torch.nn.Parameter]) -> Float[Tensor, ""]:
+def gradient_norm(parameters: Iterable[Tensor]) -> Float[Tensor, ""]:
     """L2 norm of all gradients together; 0 where there is none."""
     gradients = [p.grad for p in parameters if p.grad is not None]
     if not gradients:

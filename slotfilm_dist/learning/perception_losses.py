@@ -4,6 +4,7 @@ All are masked by visibility and divided by the number of visible objects in the
 is to be seen do not count for less per object. Objects out of view may carry any position, also one that is not finite.
 """
 
+import functools
 import itertools
 from dataclasses import dataclass
 
@@ -32,10 +33,16 @@ def best_matching(
     assert num_slots >= num_objects, "every object needs a slot of its own"
     target = torch.where(visible.unsqueeze(2), uv, 0.5)
     error = (target.unsqueeze(2) - uv_predicted.unsqueeze(1)).square().sum(3) * visible.unsqueeze(2)
-    assignments = torch.tensor(list(itertools.permutations(range(num_slots), num_objects)), device=uv.device)
+    assignments = _assignments(num_slots, num_objects, uv.device)
     sums = error[:, torch.arange(num_objects, device=uv.device), assignments].sum(2)
     least, best = sums.min(dim=1)
     return least, assignments[best]
+
+
+@functools.cache
+def _assignments(num_slots: int, num_objects: int, device: torch.device) -> Int[Tensor, "assignments objects"]:
+    """Every way to give each object a slot of its own; kept, for a CUDA graph cannot bring it to the GPU."""
+    return torch.tensor(list(itertools.permutations(range(num_slots), num_objects)), device=device)
 
 
 def position_loss(

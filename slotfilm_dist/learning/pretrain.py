@@ -6,14 +6,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float16, Int, UInt8
+from jaxtyping import Float, Float16, Int, Shaped
 from torch import Tensor, nn
 
 from slotfilm_dist.config import PretrainConfig
 from slotfilm_dist.learning.frames import PretrainFrames, mean_position, split_by_episode
 from slotfilm_dist.learning.perception_losses import pretrain_losses
 from slotfilm_dist.learning.perception_quality import PerceptionQuality, perception_quality
+from slotfilm_dist.learning.rows import Rows
 from slotfilm_dist.nets.backbone import FEATURE_CHANNELS
+from slotfilm_dist.nets.capture import Capture, Feed
 from slotfilm_dist.nets.encoder import SlotFusionEncoder
 from slotfilm_dist.nets.perception import Perception
 
@@ -42,6 +44,7 @@ class Pretrainer:
         config: lengths, weights and rates.
         seed: of the split and of the batches.
         device: where it runs.
+        cuda_graphs: on a GPU, record the step.
         max_eval_frames: held-out frames that `evaluate` looks at, spread evenly.
 
     Raises:
@@ -56,6 +59,7 @@ class Pretrainer:
         *,
         seed: int,
         device: torch.device | str = "cpu",
+        cuda_graphs: bool = True,
         max_eval_frames: int = 1024,
     ) -> None:
         assert encoder.perception is not None, "an encoder without a camera has nothing to pre-train"
@@ -65,6 +69,7 @@ class Pretrainer:
         self.num_steps = 0
         """Gradient steps done."""
         self._image_size = self.network.image_size
+        self._half = config.precision == "bfloat16"
         if frames.rgb.shape[1:3] != (self._image_size, self._image_size):
             raise ValueError(f"env.image_size = {self._image_size}: the frames are {frames.rgb.shape[1:3]} pixels")
         self._seed = seed
@@ -74,9 +79,13 @@ class Pretrainer:
         self.eval_frames = held_out[spread]
         """Frames of other episodes that `evaluate` looks at."""
         self._mean_position = torch.from_numpy(mean_position(frames, self.train_frames)).to(self.device)
-        self._features: Float16[np.ndarray, "frames tokens channels"] | None = None
+        self._rows: Rows | None = None
+        self._feed: Feed | None = None
         self._trained = self._trained_parameters()
-        self._optimizer = torch.optim.Adam(self._trained.values(), lr=config.lr, fused=True)
+        on_gpu = self.device.type == "cuda"
+        self._optimizer = torch.optim.Adam(self._trained.values(), lr=config.lr, fused=True, capturable=on_gpu)
+        self._descend = Capture(self._take_step, self.device) if cuda_graphs else self._take_step
+        self._losses = torch.full((4,), math.nan)
 
     def step(self) -> dict[str, float]:
         """One gradient step on a random batch of training frames; returns the losses by metric name.
@@ -84,25 +93,29 @@ class Pretrainer:
         Raises:
             ValueError: the loss is no longer finite.
         """
+        self.begin_step()
+        return self.losses()
+
+    def begin_step(self) -> None:
+        """One gradient step, without waiting for a GPU to make it."""
         rng = np.random.default_rng([self._seed, self.num_steps])
         chosen = np.sort(rng.choice(self.train_frames, self.config.batch_size))  # sorted: a file is read forwards
-        uv, visible = self._labels(chosen)
-        losses = pretrain_losses(
-            self._perceive(chosen, training=True),
-            uv,
-            visible,
-            self.config,
-            image_size=self._image_size,
-            matched_visibility=self.network.matched_visibility,
-        )
-        self._optimizer.zero_grad(set_to_none=True)
-        losses.total.backward()
-        parts = torch.stack((losses.total, losses.position, losses.visibility, losses.attention)).detach()
-        total, position, visibility, attention = parts.tolist()
-        if not math.isfinite(total):
-            raise ValueError(f"pre-training diverged at step {self.num_steps} (loss {total}): lower pretrain.lr")
-        self._optimizer.step()
+        batch = self._batch(chosen)
+        if self._feed is None:
+            self._feed = Feed(batch, self.device)
+        self._feed.fill(batch)
+        self._losses = self._descend()
         self.num_steps += 1
+
+    def losses(self) -> dict[str, float]:
+        """The last step's losses by metric name.
+
+        Raises:
+            ValueError: the loss is no longer finite.
+        """
+        total, position, visibility, attention = self._losses.tolist()
+        if not math.isfinite(total):
+            raise ValueError(f"pre-training diverged by step {self.num_steps} (loss {total}): lower pretrain.lr")
         return {
             "pretrain_loss": total,
             "pretrain_position_loss": position,
@@ -110,21 +123,37 @@ class Pretrainer:
             "pretrain_attention_loss": attention,
         }
 
+    def _take_step(self) -> Float[Tensor, "4"]:
+        """Descend on the fed batch; gives the total loss, then its parts."""
+        assert self._feed is not None
+        batch = self._feed.tensors
+        losses = pretrain_losses(
+            self._perceive(batch["seen"], training=True),
+            batch["uv"],
+            batch["visible"],
+            self.config,
+            image_size=self._image_size,
+            matched_visibility=self.network.matched_visibility,
+        )
+        self._optimizer.zero_grad(set_to_none=True)
+        losses.total.backward()
+        self._optimizer.step()
+        return torch.stack((losses.total, losses.position, losses.visibility, losses.attention)).detach()
+
     @torch.no_grad()
     def evaluate(self) -> PerceptionQuality:
         """How well frames of held-out episodes are understood; the baseline predicts the training frames' mean."""
-        parts = [self._perceive(chosen, training=False) for chosen in _batches(self.eval_frames)]
+        parts = [self._perceive(self._seen(chosen), training=False) for chosen in _batches(self.eval_frames)]
         perception = Perception(
             slots=torch.cat([part.slots for part in parts]),
             attention=torch.cat([part.attention for part in parts]),
             uv=torch.cat([part.uv for part in parts]),
             visible_logits=torch.cat([part.visible_logits for part in parts]),
         )
-        uv, visible = self._labels(self.eval_frames)
         return perception_quality(
             perception,
-            uv,
-            visible,
+            torch.from_numpy(self.frames.uv[self.eval_frames]).to(self.device),
+            torch.from_numpy(self.frames.visible[self.eval_frames]).to(self.device),
             self._mean_position,
             image_size=self._image_size,
             matched_visibility=self.network.matched_visibility,
@@ -168,7 +197,7 @@ class Pretrainer:
         self._optimizer.state.clear()
         for name, moments in state["adam"].items():
             self._optimizer.state[self._trained[name]] = self._adam_state(self._trained[name], moments)
-        self._features = None
+        self._rows = None
 
     def _adam_state(self, parameter: nn.Parameter, moments: Mapping[str, Any]) -> dict[str, Tensor]:
         """Adam's state in the parameter's own memory layout, which its fused kernel takes for granted."""
@@ -184,33 +213,45 @@ class Pretrainer:
         named = dict(self.network.named_parameters())
         return {name: value for name, value in named.items() if with_backbone or not name.startswith("backbone.")}
 
-    def _perceive(self, chosen: Int[np.ndarray, " batch"], *, training: bool) -> Perception:
-        """The network's view of some frames; with a trained backbone BatchNorm follows `training`."""
-        if self.config.train_backbone == "all":
-            self.encoder.train(training)
-            return self.network(self.network.tokens(self._pictures(chosen)))
-        features = torch.from_numpy(self._cached_features()[chosen]).to(self.device)
-        return self.network(self.network.projection(features.float()))
+    def _perceive(self, seen: Shaped[Tensor, "batch ..."], *, training: bool) -> Perception:
+        """The network's view of some frames, as `_seen` gives them; with a trained backbone BatchNorm follows
+        `training`."""
+        rows = self._all_rows().on_device(seen)
+        with torch.autocast(self.device.type, torch.bfloat16, self._half, cache_enabled=False):
+            if self.config.train_backbone == "all":
+                self.encoder.train(training)
+                tokens = self.network.tokens(rows)
+            else:
+                tokens = self.network.projection(rows.float())
+        return self.network(tokens.float())
+
+    def _batch(self, chosen: Int[np.ndarray, " batch"]) -> dict[str, np.ndarray]:
+        """What a step needs of some frames."""
+        return {
+            "seen": self._all_rows().take(chosen),
+            "uv": self.frames.uv[chosen],
+            "visible": self.frames.visible[chosen],
+        }
+
+    def _seen(self, chosen: Int[np.ndarray, " batch"]) -> Shaped[Tensor, "batch ..."]:
+        return torch.from_numpy(self._all_rows().take(chosen)).to(self.device)
+
+    def _all_rows(self) -> Rows:
+        """The pictures, or the unchanging backbone's features of every frame, computed at the first call."""
+        if self._rows is None:
+            pictures = Rows(self.frames.rgb, self.device)
+            self._rows = pictures if self.config.train_backbone == "all" else Rows(self._features(), self.device)
+        return self._rows
 
     @torch.no_grad()
-    def _cached_features(self) -> Float16[np.ndarray, "frames tokens channels"]:
-        """The unchanging backbone's features of every frame, computed at the first call."""
-        if self._features is None:
-            self.encoder.eval()
-            num_frames, num_tokens = len(self.frames.rgb), self.network.grid_size**2
-            self._features = np.empty((num_frames, num_tokens, FEATURE_CHANNELS), np.float16)
-            for chosen in _batches(np.arange(num_frames)):
-                self._features[chosen] = self.network.backbone(self._pictures(chosen)).half().cpu().numpy()
-        return self._features
-
-    def _pictures(self, chosen: Int[np.ndarray, " batch"]) -> UInt8[Tensor, "batch height width 3"]:
-        return torch.from_numpy(np.asarray(self.frames.rgb[chosen])).to(self.device)
-
-    def _labels(
-        self, chosen: Int[np.ndarray, " batch"]
-    ) -> tuple[Float[Tensor, "batch objects 2"], Bool[Tensor, "batch objects"]]:
-        uv, visible = torch.from_numpy(self.frames.uv[chosen]), torch.from_numpy(self.frames.visible[chosen])
-        return uv.to(self.device), visible.to(self.device)
+    def _features(self) -> Float16[np.ndarray, "frames tokens channels"]:
+        self.encoder.eval()
+        rgb = self.frames.rgb
+        features = np.empty((len(rgb), self.network.grid_size**2, FEATURE_CHANNELS), np.float16)
+        for chosen in _batches(np.arange(len(rgb))):
+            pictures = torch.from_numpy(np.asarray(rgb[chosen])).to(self.device)
+            features[chosen] = self.network.backbone(pictures).half().cpu().numpy()
+        return features
 
 
 def _batches(chosen: Int[np.ndarray, " frames"]) -> list[Int[np.ndarray, " batch"]]:

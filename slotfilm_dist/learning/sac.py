@@ -22,7 +22,7 @@ Departures:
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -36,9 +36,43 @@ from slotfilm_dist.learning.lean_adam import LeanAdam
 from slotfilm_dist.learning.off_policy import METRICS_EVERY, OffPolicyLearner, gradient_norm
 from slotfilm_dist.messages import SampleBatch
 from slotfilm_dist.nets.agent import AgentEncoder
+from slotfilm_dist.nets.capture import Aside
 from slotfilm_dist.nets.policy_heads import Actor, TwinCritic, ValueNet
 
+BATCH_FIELDS = (
+    "visual",
+    "next_visual",
+    "proprio",
+    "next_proprio",
+    "goal",
+    "next_goal",
+    "action",
+    "reward",
+    "terminated",
+    "truncated",
+)
+"""What an update reads of a batch."""
 ADVICE = "lower lr.critic_value or lr.fusion, set sac.critic_norm = layer"
+
+
+class CriticTerms(NamedTuple):
+    """Half of an update: the critics and the encoder."""
+
+    loss: Float[Tensor, ""]
+    latent: Float[Tensor, "seen latent"]
+    q: Float[Tensor, "2 seen"]
+    target: Float[Tensor, " batch"]
+
+
+class PolicyTerms(NamedTuple):
+    """The other half: value network and actor, whose losses share no parameter and are added."""
+
+    loss: Float[Tensor, ""]
+    value_loss: Float[Tensor, ""]
+    actor_loss: Float[Tensor, ""]
+    value: Float[Tensor, " batch"]
+    log_prob: Float[Tensor, " batch"]
+    temperature: Float[Tensor, ""]
 
 
 class SacLearner(OffPolicyLearner[Actor]):
@@ -76,6 +110,8 @@ class SacLearner(OffPolicyLearner[Actor]):
         self.target_value.load_state_dict(self.value.state_dict())
         self.target_value.requires_grad_(False)
         self.log_temperature = torch.tensor(math.log(sac.temperature), device=device, requires_grad=True)
+        self._aside = Aside(torch.device("cpu"))
+        """Where the graphs of a GPU fork."""
         self._build_optimisers()
 
     def _build_optimisers(self) -> None:
@@ -92,7 +128,7 @@ class SacLearner(OffPolicyLearner[Actor]):
                 {"params": list(self.actor.parameters()), "lr": lr.actor},
             ]
         )
-        self._temperature_optimiser = torch.optim.Adam([self.log_temperature], lr=lr.temperature)
+        self._temperature_optimiser = LeanAdam([{"params": [self.log_temperature], "lr": lr.temperature}])
         self._targets = [p.data for p in self.target_value.parameters()]
         self._online = [p.data for p in self.value.parameters()]
 
@@ -103,50 +139,72 @@ class SacLearner(OffPolicyLearner[Actor]):
             TrainingDivergedError: loss or gradient was not finite `MAX_SKIPPED` times in a row.
         """
         sac = self.config.sac
-        action, terminated, truncated = (self._tensor(x) for x in (batch.action, batch.terminated, batch.truncated))
-        reward = self._tensor(batch.reward) * sac.reward_scale
-        latent = self._encode(batch.visual, batch.proprio, batch.goal)
-        with torch.no_grad():
-            next_latent = self._encode(batch.next_visual, batch.next_proprio, batch.next_goal)
-            mask = losses.bootstrap_mask(terminated, truncated, sac.bootstrap)
-            next_value = self.target_value(next_latent).view(-1, len(reward)).mean(dim=0)
-            target = losses.critic_target(reward, mask, next_value, sac.gamma)
-        views = max(1, sac.augment_views)
-        q = self.critic(latent, action.repeat(views, 1))
-        critic_loss = losses.critic_loss(q, target.repeat(views))
-        if not self._descend(self._critic_optimiser, critic_loss, sac.grad_clip, ADVICE):
+        tensors = {name: self._tensor(getattr(batch, name)) for name in BATCH_FIELDS}
+        critics = self._critic_terms(tensors)
+        if not self._descend(self._critic_optimiser, critics.loss, sac.grad_clip, ADVICE):
             return
-
-        seen = latent[: len(action)].detach()
-        noise = torch.randn(action.shape, generator=self._noise, device=self.device)
-        sample = self.actor(seen, noise)
-        temperature = self.log_temperature.detach().exp()
-        min_q = self.critic(seen, sample.action, frozen=True).amin(dim=0)
-        value = self.value(seen)
-        value_loss = losses.value_loss(value, min_q.detach(), sample.log_prob.detach(), temperature)
-        actor_loss = losses.actor_loss(min_q, sample.log_prob, temperature)
-        if not self._descend(self._policy_optimiser, value_loss + actor_loss, 0.0, ADVICE):
+        noise = torch.randn(batch.action.shape, generator=self._noise, device=self.device)
+        policy = self._policy_terms(critics.latent[: len(noise)].detach(), noise)
+        if not self._descend(self._policy_optimiser, policy.loss, 0.0, ADVICE):
             return
         if sac.temperature_mode == "auto":
-            self._step_temperature(sample.log_prob.detach())
+            self._step_temperature(policy.log_prob)
         elif sac.temperature_mode == "annealed":
             self._set_temperature(annealed_temperature(sac, self.updates + 1))
         losses.polyak(self._targets, self._online, sac.tau)
         self._count_update()
         if self.updates % METRICS_EVERY == 0:
-            self._metrics = self._gradient_norms() | self.encoder.diagnostics(self._tensor(batch.proprio))
-            self._metrics |= {
-                "learner_critic_loss": critic_loss.detach(),
-                "learner_value_loss": value_loss.detach(),
-                "learner_actor_loss": actor_loss.detach(),
-                "learner_q_mean": q.detach().mean(),
-                "learner_q_max": q.detach().max(),
-                "learner_value_mean": value.detach().mean(),
-                "learner_target_mean": target.mean(),
-                "learner_reward_mean": reward.mean(),
-                "learner_entropy_nats": -sample.log_prob.detach().mean(),
-                "learner_temperature": temperature,
-            }
+            self._metrics = self._measure(tensors, critics, policy)
+
+    def _critic_terms(self, batch: Mapping[str, Tensor]) -> CriticTerms:
+        """What the critics and the encoder learn from."""
+        sac = self.config.sac
+        latent = self._encode(batch["visual"], batch["proprio"], batch["goal"])
+        with self._aside:
+            target = self._critic_target(batch)
+        views = max(1, sac.augment_views)
+        q = self.critic(latent, batch["action"].repeat(views, 1))
+        self._aside.join()
+        return CriticTerms(losses.critic_loss(q, target.repeat(views)), latent, q, target)
+
+    @torch.no_grad()
+    def _critic_target(self, batch: Mapping[str, Tensor]) -> Float[Tensor, " batch"]:
+        sac = self.config.sac
+        reward = batch["reward"] * sac.reward_scale
+        next_latent = self._encode(batch["next_visual"], batch["next_proprio"], batch["next_goal"])
+        mask = losses.bootstrap_mask(batch["terminated"], batch["truncated"], sac.bootstrap)
+        next_value = self.target_value(next_latent).view(-1, len(reward)).mean(dim=0)
+        return losses.critic_target(reward, mask, next_value, sac.gamma)
+
+    def _policy_terms(self, seen: Float[Tensor, "batch latent"], noise: Float[Tensor, "batch action"]) -> PolicyTerms:
+        """What the value network and the actor learn from."""
+        with self._aside:
+            value = self.value(seen)
+        sample = self.actor(seen, noise)
+        temperature = self.log_temperature.detach().exp()
+        min_q = self.critic(seen, sample.action, frozen=True).amin(dim=0)
+        self._aside.join()
+        log_prob = sample.log_prob.detach()
+        value_loss = losses.value_loss(value, min_q.detach(), log_prob, temperature)
+        actor_loss = losses.actor_loss(min_q, sample.log_prob, temperature)
+        return PolicyTerms(value_loss + actor_loss, value_loss, actor_loss, value, log_prob, temperature)
+
+    def _measure(self, batch: Mapping[str, Tensor], critics: CriticTerms, policy: PolicyTerms) -> dict[str, Tensor]:
+        """The metrics of an update."""
+        return {
+            **self._gradient_norms(),
+            **self.encoder.diagnostics(batch["proprio"]),
+            "learner_critic_loss": critics.loss.detach(),
+            "learner_value_loss": policy.value_loss.detach(),
+            "learner_actor_loss": policy.actor_loss.detach(),
+            "learner_q_mean": critics.q.detach().mean(),
+            "learner_q_max": critics.q.detach().max(),
+            "learner_value_mean": policy.value.detach().mean(),
+            "learner_target_mean": critics.target.mean(),
+            "learner_reward_mean": self.config.sac.reward_scale * batch["reward"].mean(),
+            "learner_entropy_nats": -policy.log_prob.mean(),
+            "learner_temperature": policy.temperature,
+        }
 
     def _step_temperature(self, log_prob: Float[Tensor, " batch"]) -> None:
         self._temperature_optimiser.zero_grad(set_to_none=True)
@@ -163,15 +221,14 @@ class SacLearner(OffPolicyLearner[Actor]):
         }
         return {name: gradient_norm(parameters) for name, parameters in norms.items()}
 
-    def _encode(self, visual: np.ndarray, proprio: np.ndarray, goal: np.ndarray) -> Float[Tensor, "seen latent"]:
+    def _encode(self, visual: Tensor, proprio: Tensor, goal: Tensor) -> Float[Tensor, "seen latent"]:
         """Latents; with `sac.augment_views`, those of every sample's first shifted view, then of all second ones."""
-        seen, state, goals = (self._tensor(x) for x in (visual, proprio, goal))
         sac = self.config.sac
         if sac.augment_views:
-            shifted = [random_shift(seen, sac.augment_shift_px, self._noise) for _ in range(sac.augment_views)]
-            seen = torch.cat(shifted)
-            state, goals = state.repeat(sac.augment_views, 1), goals.repeat(sac.augment_views, 1)
-        return self.encoder(seen, state, goals)
+            shifted = [random_shift(visual, sac.augment_shift_px, self._noise) for _ in range(sac.augment_views)]
+            visual = torch.cat(shifted)
+            proprio, goal = proprio.repeat(sac.augment_views, 1), goal.repeat(sac.augment_views, 1)
+        return self.encoder(visual, proprio, goal)
 
     def modules(self) -> dict[str, torch.nn.Module]:
         """Every network by name, for checkpoints."""

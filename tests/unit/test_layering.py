@@ -38,6 +38,7 @@ LEVELS: dict[str, int] = {
     "learning": 2,  # losses and other pure functions; the loops are named below
     "learning.learner": 3,
     "learning.recovery": 3,
+    "learning.graphed_sac": 3,
     "learning.sac": 3,
     "learning.ddpg": 3,
     "learning.pretrain": 3,

@@ -78,8 +78,8 @@ def test_without_views_pictures_are_seen_as_they_are() -> None:
     learner, batch = build("cnn"), batch_of()
     state = learner._noise.get_state()
     with torch.no_grad():
-        seen = learner._encode(batch.visual, batch.proprio, batch.goal)
-        plain = learner.encoder(*(torch.from_numpy(x) for x in (batch.visual, batch.proprio, batch.goal)))
+        given = [torch.from_numpy(x) for x in (batch.visual, batch.proprio, batch.goal)]
+        seen, plain = learner._encode(*given), learner.encoder(*given)
     assert torch.equal(seen, plain)
     assert torch.equal(learner._noise.get_state(), state)
 
