@@ -1,7 +1,7 @@
 """Soft Actor-Critic whose whole update is one CUDA graph: hundreds of small kernels at the price of one launch.
 
-It never waits for the GPU within an update. So a loss or gradient that is not finite is found there: the optimisers then
-change nothing, a counter goes up, and the host reads the counters now and then and takes those updates back.
+It never waits for the GPU within an update. So a loss or gradient that is not finite is found there: the optimisers
+then change nothing, a counter goes up, and the host reads the counters now and then and takes those updates back.
 """
 
 from collections.abc import Mapping
@@ -40,7 +40,7 @@ class GraphedSac(SacLearner):
         device: torch.device,
     ) -> None:
         super().__init__(config, encoder, action_dim, seed, device)
-        assert encoder.visual_kind != "rgb" and not config.sac.augment_views, "pictures are updated without a graph"
+        assert encoder.visual_kind != "rgb", "pictures are updated without a graph"
         self._aside = Aside(device)
         shape = config.sac.batch_size, action_dim
         self._action_noise = torch.zeros(shape, device=device)

@@ -6,7 +6,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-
 PIECE = 8192
 """Elements of a piece, see `pieces`."""
 
@@ -50,10 +49,8 @@ class LeanAdam(torch.optim.Adam):
         assert self._lists is not None
         if gradients[0][0].is_cuda:
             gradients = [
-                pieces(
-                    g.contiguous() if p.is_contiguous() else g for p, g in zip(group["params"], of_group, strict=True)
-                )
-                for group, of_group in zip(self.param_groups, gradients, strict=True)
+                pieces(g.contiguous() if p.is_contiguous() else g for p, g in zip(of["params"], grads, strict=True))
+                for of, grads in zip(self.param_groups, gradients, strict=True)
             ]
         for group, grads, (parameters, first, second, steps) in zip(
             self.param_groups, gradients, self._lists, strict=True

@@ -69,8 +69,9 @@ class OffPolicyLearner(abc.ABC, Generic[ActorT]):
         """Learned tensors that belong to no network, for checkpoints."""
         return {}
 
-    def settle(self) -> None:  # noqa: B027  # nothing to wait for where every update looks at its own losses
+    def settle(self) -> None:
         """Wait for updates under way, after which `updates` counts those that were made."""
+        return  # there are none where every update looks at its own losses
 
     def metrics(self) -> dict[str, float]:
         """The latest measurements, by the metric catalogue's names."""

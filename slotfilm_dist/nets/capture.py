@@ -1,4 +1,4 @@
-"""Functions of tensors as CUDA graphs: with small networks it is the launches that take the time, not the arithmetic."""
+"""Functions of tensors as CUDA graphs: of small networks it is the launches that take time, not the arithmetic."""
 
 import contextlib
 from collections.abc import Callable, Mapping

@@ -48,6 +48,11 @@ def broken(batch: SampleBatch) -> SampleBatch:
     return replace(batch, reward=np.full(SIZE, np.nan, np.float32))
 
 
+def break_it(learner: SacLearner, num_updates: int) -> None:
+    for i in range(num_updates):
+        learner.update(broken(batch_of(i)))
+
+
 def tensors(learner: SacLearner) -> dict[str, torch.Tensor]:
     return {k: v.double() for k, v in learner.save()["tensors"].items() if k != "noise_state"}
 
@@ -98,8 +103,7 @@ def test_update_that_is_not_finite_changes_nothing_and_is_not_counted(device: st
 def test_divergence_is_raised_once_and_counted(device: str) -> None:
     learner = build(GraphedSac, device)
     with pytest.raises(TrainingDivergedError, match="not finite"):
-        for i in range(MAX_SKIPPED + SETTLE_EVERY):
-            learner.update(broken(batch_of(i)))
+        break_it(learner, MAX_SKIPPED + SETTLE_EVERY)
     assert learner.updates == 0
     assert learner.skipped_updates >= MAX_SKIPPED
     for i in range(SETTLE_EVERY):
@@ -111,12 +115,10 @@ def test_divergence_is_raised_once_and_counted(device: str) -> None:
 @DEVICES
 def test_few_failures_in_a_row_are_remembered_across_readings(device: str) -> None:
     learner = build(GraphedSac, device)
-    for i in range(MAX_SKIPPED - 1):
-        learner.update(broken(batch_of(i)))
+    break_it(learner, MAX_SKIPPED - 1)
     learner.settle()
     with pytest.raises(TrainingDivergedError):
-        for i in range(SETTLE_EVERY):
-            learner.update(broken(batch_of(i)))
+        break_it(learner, SETTLE_EVERY)
 
 
 @DEVICES
