@@ -48,6 +48,9 @@ class GraphedSac(SacLearner):
         """Updates skipped in all, in a row up to now, and at most in a row, since the last reading."""
         self._unread = self._worst = 0
         self._feed: Feed | None = None
+        if config.runtime.compiled:
+            for network in (encoder, self.actor, self.critic, self.value, self.target_value):
+                network.compile()
         self._record_anew()
 
     def _record_anew(self) -> None:

@@ -1,6 +1,7 @@
 """What the off-policy learners share: saving and loading, metrics, and a halt when losses stop being finite."""
 
 import abc
+import hashlib
 import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any, Generic, TypeVar
@@ -18,6 +19,8 @@ from slotfilm_dist.nets.policy_heads import Actor
 
 METRICS_EVERY = 10
 """Updates between measurements of the metrics; reading them every time would cost a tenth of an update."""
+NOISE_STATE_BYTES = (torch.Generator().get_state().numel(), 16)
+"""Sizes of a random stream's state on a CPU and on a GPU."""
 MAX_SKIPPED = 10
 """Updates skipped in a row, for a loss or gradient that is not finite, after which training has diverged."""
 
@@ -120,12 +123,21 @@ class OffPolicyLearner(abc.ABC, Generic[ActorT]):
         with torch.no_grad():
             for name, own in loose.items():
                 own.copy_(tensors[name])
-        try:
-            self._noise.set_state(tensors["noise_state"])
-        except (RuntimeError, TypeError) as error:
-            raise ValueError(f"checkpoint: noise_state is no state of a random stream ({error})") from None
+        self._load_noise(tensors["noise_state"])
         self.updates = state["updates"]
         self.skipped_updates = state["skipped_updates"]
+
+    def _load_noise(self, state: Tensor) -> None:
+        """Continue the random stream; one of another device cannot be, so a new one is drawn from its state."""
+        own = self._noise.get_state().numel()
+        if state.numel() != own and state.numel() in NOISE_STATE_BYTES:
+            digest = hashlib.sha256(state.numpy().tobytes()).digest()
+            self._noise.manual_seed(int.from_bytes(digest[:8], "big") >> 1)
+            return
+        try:
+            self._noise.set_state(state)
+        except (RuntimeError, TypeError) as error:
+            raise ValueError(f"checkpoint: noise_state is no state of a random stream ({error})") from None
 
     def scale_rates(self, factor: float) -> None:
         """Multiply every optimiser's rate."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from slotfilm_dist.config import EncoderConfig, RunConfig, SacConfig
+from slotfilm_dist.config import EncoderConfig, RunConfig, RuntimeConfig, SacConfig
 from slotfilm_dist.learning.graphed_sac import SETTLE_EVERY, GraphedSac
 from slotfilm_dist.learning.off_policy import MAX_SKIPPED, TrainingDivergedError
 from slotfilm_dist.learning.sac import SacLearner
@@ -144,3 +144,44 @@ def test_changed_rates_count_from_the_next_update(device: str) -> None:
     for i in range(8):
         learner.update(batch_of(i))
     assert all(torch.equal(before[name], p) for name, p in learner.critic.named_parameters())
+
+
+def test_compiled_networks_update_the_same() -> None:
+    config = RunConfig(
+        encoder=EncoderConfig(backbone="random"),
+        sac=SacConfig(hidden=(16, 16), batch_size=SIZE),
+        runtime=RuntimeConfig(compiled=True),
+    )
+    made = SlotFusionEncoder(config.encoder, config.obs, 128, seed=3)
+    made.freeze_backbone()
+    compiled = GraphedSac(config, made.eval(), 7, np.random.SeedSequence(0), torch.device("cpu"))
+    plain = build(SacLearner, "cpu")
+    for i in range(4):
+        compiled.update(batch_of(i))
+        plain.update(batch_of(i))
+    assert_close(compiled, plain, 1e-4)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize(("ours", "theirs"), [("cuda", "cpu"), ("cpu", "cuda")])
+def test_checkpoint_moves_between_gpu_and_cpu(ours: str, theirs: str) -> None:
+    first = build(GraphedSac, ours)
+    for i in range(8):
+        first.update(batch_of(i))
+    second = build(GraphedSac, theirs)
+    second.load(first.save())
+    assert second.updates == 8
+    assert_close(first, second, 1e-6)
+    second.update(batch_of(8))
+
+
+def test_random_stream_of_a_gpu_becomes_one_of_the_cpu() -> None:
+    first, second = (build(GraphedSac, "cpu") for _ in range(2))
+    saved = first.save()
+    saved["tensors"]["noise_state"] = torch.arange(16, dtype=torch.uint8)
+    first.load(saved)
+    second.load(saved)
+    first.update(batch_of(0))
+    second.update(batch_of(0))
+    assert_close(first, second, 0.0)
