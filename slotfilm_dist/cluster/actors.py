@@ -159,7 +159,7 @@ class InferenceActor:
     def __init__(self, config: RunConfig, hub: Any, labels: Mapping[str, str], *, gpu: bool) -> None:
         import torch
 
-        from slotfilm_dist.cluster.inference import InferenceServer
+        from slotfilm_dist.cluster.inference import DEADLINE_S, InferenceServer
         from slotfilm_dist.cluster.ray_sink import RaySink
         from slotfilm_dist.cluster.worker import build_policy
         from slotfilm_dist.seeds import Role, role_seed
@@ -168,8 +168,14 @@ class InferenceActor:
         torch.set_num_threads(config.runtime.worker_threads)
         device = torch.device("cuda" if gpu else "cpu")
         policy = build_policy(config, hub.agent_setup(), role_seed(config.seed, Role.ACTIONS), device=device)
+        runtime = config.runtime
         self._server = InferenceServer(
-            policy, hub, max_staleness_s=config.runtime.max_staleness_s, cuda_graphs=config.runtime.cuda_graphs
+            policy,
+            hub,
+            # A recorded pass takes a GPU less time than anyone would wait to share one.
+            deadline_s=0.0 if gpu and runtime.cuda_graphs else DEADLINE_S,
+            max_staleness_s=runtime.max_staleness_s,
+            cuda_graphs=runtime.cuda_graphs,
         )
         self._sink = FanOut([RaySink(labels, "central")] if labels else [])
 
