@@ -41,6 +41,9 @@ class UnlimitedHub:
     def refund_updates(self, num_updates: int) -> None:
         """Nothing is counted."""
 
+    def start_over(self, missing_steps: int) -> None:
+        """Nothing is counted."""
+
     def publish(self, snapshot: WeightSnapshot) -> None:
         """Nobody acts."""
 

@@ -33,6 +33,10 @@ class LossyHub:
         """Take back updates that did not happen."""
         self._hub.refund_updates(num_updates)
 
+    def start_over(self, missing_steps: int) -> None:
+        """As the hub does."""
+        self._hub.start_over(missing_steps)
+
     def publish(self, snapshot: WeightSnapshot) -> None:
         """Take the newest weights, or lose them."""
         if self._switches.lasting("lose_weights") is None:

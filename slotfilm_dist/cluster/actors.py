@@ -91,8 +91,8 @@ class ShardActor:
         return self._role.insert(block)
 
     @ray.method(concurrency_group="draw")
-    def draw(self, sizes: Sequence[int]) -> Any:
-        return self._role.draw(sizes)
+    def draw(self, num_rows: int) -> Any:
+        return self._role.draw(num_rows)
 
     @ray.method(concurrency_group="control")
     def call(self, method: str, *arguments: Any) -> Any:

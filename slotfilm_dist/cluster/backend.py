@@ -300,7 +300,7 @@ class RayBackend:
         stored = [shard.beat(LONG_S).stats.num_steps for shard in self._shards]
         if sum(stored) == 0:
             self._learning.refill(self._replay_client)
-        self._watch = ShardWatch(self._shards, self._config.replay.min_steps, self._counts.start_over)
+        self._watch = ShardWatch(self._shards)
 
     def _replay_client(self) -> ReplayClient:
         return ReplayClient(self._shards, role_seed(self._config.seed, Role.REPLAY, 0, self._learning.num_restarts))

@@ -31,8 +31,8 @@ def chunk_updates(updates_per_step: float) -> int:
 def build_limiter(updates_per_step: float, min_steps: int, block_steps: int) -> RateLimiter:
     """A limiter whose ratio is off by at most 1 % of 10,000 steps for blocks of up to 55 steps.
 
-    The workers' lead (64 steps) and the three chunks of updates that the learner has been granted and not yet made
-    (24 steps) stay below 100 steps. Larger blocks need a larger lead.
+    The workers' lead (64 steps) and the four chunks of updates that the learner has been granted and not yet made (32
+    steps: two being fetched, one ready, one in use) stay below 100 steps. Larger blocks need a larger lead.
     """
     needed = block_steps + -(-chunk_updates(updates_per_step) // updates_per_step) + 1
     return RateLimiter(updates_per_step, min_steps, slack_updates=0, slack_steps=max(SLACK_STEPS, int(needed)))

@@ -1,4 +1,4 @@
-"""The two threads of a learner on a cluster: one fetches batches ahead, the other updates and publishes weights."""
+"""The threads of a learner on a cluster: two fetch batches ahead, another updates and publishes weights."""
 
 import dataclasses
 import queue
@@ -14,9 +14,14 @@ from slotfilm_dist.learning.learner import Learner
 from slotfilm_dist.learning.off_policy import TrainingDivergedError
 from slotfilm_dist.learning.recovery import Recovery
 from slotfilm_dist.messages import SampleBatch, TransitionBlock, WeightSnapshot
+from slotfilm_dist.replay.sharded import EmptyReplayError
 
 ADMIT_S = 0.5
 """Longest wait of one request for updates; what is due by then is granted."""
+FETCHERS = 2
+"""Requests for batches under way at once; each more lets the learner fall further behind the limiter's count."""
+RESTORE_S = 10.0
+"""Time that lost shards have to bring back what they held before workers fill replay up."""
 RETRY_S = 0.25
 """Pause before replay is asked again."""
 REQUEST_BYTES = 32 << 20
@@ -33,6 +38,10 @@ class UpdateLink(Protocol):
 
     def refund_updates(self, num_updates: int) -> None:
         """Take back updates that did not happen."""
+        ...
+
+    def start_over(self, missing_steps: int) -> None:
+        """Let workers bring so many steps before the next update; none is owed for them."""
         ...
 
     def publish(self, snapshot: WeightSnapshot) -> None:
@@ -91,15 +100,17 @@ class Publisher:
 
 
 class LearningLoops:
-    """Runs two threads from `start` to `stop`.
+    """Runs its threads from `start` to `stop`.
 
-    *Fetcher*: consumes grants of updates and replay; produces chunks of batches, one ready while the next is fetched.
-    Waits for the limiter, for replay to hold `replay.min_steps`, for a shard's answer, and for room.
+    *Fetchers*: consume grants of updates and replay; produce chunks of batches, one ready while the next are fetched:
+    one fetcher waits for shards while the other takes its batches apart. Wait for the limiter, for replay to hold
+    `replay.min_steps`, for a shard's answer, and for room. Replay that stays too small, because shards were lost with
+    what they held, is filled up by the workers before the next update.
 
     *Updater*: consumes chunks; produces updates and, every `runtime.publish_every`, weights. Waits for a chunk. Updates
     that stay non-finite take it back to the last checkpoint.
 
-    Both stop within a slice of their waits; updates that were granted and not made are given back. An error stops both
+    All stop within a slice of their waits; updates that were granted and not made are given back. An error stops all
     and is kept in `error`.
 
     Args:
@@ -126,16 +137,17 @@ class LearningLoops:
         self._stopping = threading.Event()
         self._ready: queue.Queue[list[SampleBatch]] = queue.Queue(1)
         self._granted = self._made = 0
+        self._counting = threading.Lock()
         self._counted = learner.updates
         self.waiting_for = self.error = ""
         self.waited_s = self.batch_wait_s = self.update_s = 0.0
         self._threads = [
             threading.Thread(target=self._guard, args=(loop,), name=loop.__name__.strip("_"), daemon=True)
-            for loop in (self._fetch_loop, self._update_loop)
+            for loop in (*[self._fetch_loop] * FETCHERS, self._update_loop)
         ]
 
     def start(self) -> None:
-        """Start both threads."""
+        """Start the threads."""
         for thread in self._threads:
             thread.start()
 
@@ -175,20 +187,25 @@ class LearningLoops:
             grant = self._hub.admit_updates(chunk, ADMIT_S)
             self.waiting_for = grant.waiting_for and f"the limiter: {grant.waiting_for}"
             if grant.num_updates:
-                self._granted += grant.num_updates
+                with self._counting:
+                    self._granted += grant.num_updates
                 self._pass_on(self._fetch(grant.num_updates, size))
 
     def _fetch(self, num_batches: int, batch_size: int) -> list[SampleBatch]:
-        """Batches, once replay holds enough; none when the loop is told to stop."""
-        wanted = self._config.replay.min_steps
+        """Batches, once replay holds enough; none when the loop is told to stop, or where replay stays too small."""
+        wanted, began, stored = self._config.replay.min_steps, time.monotonic(), 0
         while not self._stopping.is_set():
             try:
                 stored = self._store.num_steps()
                 if stored >= wanted:
                     return self._store.sample(num_batches, batch_size)
                 self.waiting_for = f"replay to hold {wanted} steps; it holds {stored}"
-            except (RoleLostError, RoleSilentError) as error:
+            except (RoleLostError, RoleSilentError, EmptyReplayError) as error:
                 self.waiting_for = str(error)
+            if stored < wanted and time.monotonic() - began > RESTORE_S:
+                self._give_back(made=0, granted=num_batches)
+                self._hub.start_over(wanted - stored)
+                return []
             self._stopping.wait(RETRY_S)
         return []
 
@@ -243,11 +260,13 @@ class LearningLoops:
         """Updates made since the last call; fewer than none where earlier ones turn out to have been skipped."""
         made = self._learner.updates - self._counted
         self._counted += made
-        self._made += made
+        with self._counting:
+            self._made += made
         return made
 
     def _give_back(self, *, made: int, granted: int) -> None:
         """Updates that are due again: some that were made and are lost, some that were granted and not made."""
-        self._made -= made
-        self._granted -= made + granted
+        with self._counting:
+            self._made -= made
+            self._granted -= made + granted
         self._hub.refund_updates(made + granted)

@@ -1,5 +1,6 @@
 """The replay shards as the other roles see them: each of its own, or all as one store."""
 
+import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -15,7 +16,7 @@ from slotfilm_dist.config import RunConfig
 from slotfilm_dist.messages import SampleBatch, TransitionBlock
 from slotfilm_dist.replay.ledger import shard_of
 from slotfilm_dist.replay.schema import ReplaySchema
-from slotfilm_dist.replay.sharded import join_batches, split_draws
+from slotfilm_dist.replay.sharded import cut, join_batches, split_draws
 
 DRAW_S = 2.0
 """Longest wait for a shard's batches before the other shards are asked instead."""
@@ -72,12 +73,12 @@ class ShardClient:
         """The result of `begin_insert`."""
         return self._link.answer(request, "a block to be stored", INSERT_S)
 
-    def begin_draw(self, sizes: Sequence[int]) -> Any:
-        """Ask for batches; `await_draw` takes them."""
-        return self._link.begin("draw", list(sizes))
+    def begin_draw(self, num_rows: int) -> Any:
+        """Ask for transitions; `await_draw` takes them."""
+        return self._link.begin("draw", num_rows)
 
-    def await_draw(self, request: Any) -> tuple[list[SampleBatch], int]:
-        """The result of `begin_draw`: batches, and steps stored."""
+    def await_draw(self, request: Any) -> tuple[SampleBatch, int]:
+        """The result of `begin_draw`: transitions, and steps stored."""
         return self._link.answer(request, "batches", DRAW_S)
 
     def begin_count(self) -> Any:
@@ -141,7 +142,7 @@ class ShardClient:
 
 
 class ReplayClient:
-    """All shards as one `ReplayStore`. For one thread at a time; every role has its own.
+    """All shards as one `ReplayStore`. Several threads may sample at once; every role has its own.
 
     A shard that is lost or silent counts as empty until it answers again, so the others are drawn from in proportion to
     what they hold.
@@ -154,6 +155,8 @@ class ReplayClient:
     def __init__(self, shards: Sequence[ShardClient], seed: np.random.SeedSequence) -> None:
         self._shards = list(shards)
         self._rng = np.random.default_rng(seed)
+        self._choosing = threading.Lock()
+        """Held while it is settled which shards to draw from; not while they are waited for."""
         self._sizes = [0] * len(shards)
         self._counts: dict[int, Any] = {}
         self._asked_at = [0.0] * len(shards)
@@ -185,32 +188,39 @@ class ReplayClient:
         """Draw batches uniformly over the steps of all shards that answer.
 
         Raises:
-            ValueError: nothing is stored in the shards that answer.
+            EmptyReplayError: nothing is stored in the shards that answer.
         """
         while True:
-            self._refresh(wait=sum(self._sizes) == 0)
-            sizes = split_draws(self._rng, self._sizes, num_batches, batch_size)
-            asked = [
-                (shard, shard.begin_draw(wanted.tolist()))
-                for shard, wanted in zip(self._shards, sizes.T, strict=True)
-                if wanted.any()
+            with self._choosing:
+                self._refresh(wait=sum(self._sizes) == 0)
+                sizes = split_draws(self._rng, self._sizes, num_batches, batch_size)
+                # One message for all batches: what comes of a shard is cut up here.
+                asked = [
+                    (shard, wanted, shard.begin_draw(int(wanted.sum())))
+                    for shard, wanted in zip(self._shards, sizes.T, strict=True)
+                    if wanted.any()
+                ]
+            parts = [
+                cut(rows, wanted)
+                for shard, wanted, request in asked
+                if (rows := self._drawn(shard, request)) is not None
             ]
-            parts = [batches for shard, request in asked if (batches := self._drawn(shard, request)) is not None]
             if len(parts) == len(asked):
                 return [join_batches(of_shards) for of_shards in zip(*parts, strict=True)]
 
     def num_steps(self) -> int:
         """Steps stored in the shards that answer."""
-        self._refresh(wait=sum(self._sizes) == 0)
-        return sum(self._sizes)
+        with self._choosing:
+            self._refresh(wait=sum(self._sizes) == 0)
+            return sum(self._sizes)
 
-    def _drawn(self, shard: ShardClient, request: Any) -> list[SampleBatch] | None:
+    def _drawn(self, shard: ShardClient, request: Any) -> SampleBatch | None:
         try:
-            batches, self._sizes[shard.index] = shard.await_draw(request)
+            rows, self._sizes[shard.index] = shard.await_draw(request)
         except (RoleLostError, RoleSilentError, ValueError):
             self._sizes[shard.index] = 0
             return None
-        return batches
+        return rows
 
     def _refresh(self, *, wait: bool) -> None:
         """Ask shards that count as empty how much they hold."""

@@ -3,7 +3,7 @@
 import os
 import threading
 import uuid
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -95,14 +95,14 @@ class ShardRole:
         with self._lock:
             return self._shard.insert(block)
 
-    def draw(self, sizes: Sequence[int]) -> tuple[list[SampleBatch], int]:
-        """One batch of each size, and the number of steps stored now.
+    def draw(self, num_rows: int) -> tuple[SampleBatch, int]:
+        """That many transitions, and the number of steps stored now.
 
         Raises:
             ValueError: nothing is stored.
         """
         with self._lock:
-            return self._shard.draw(sizes), self._shard.num_steps()
+            return self._shard.draw([num_rows])[0], self._shard.num_steps()
 
     def num_steps(self) -> int:
         """Steps stored now."""

@@ -263,25 +263,17 @@ class ShardHandle(Protocol):
 
 
 class ShardWatch:
-    """Counts the shards' restarts and notices when too little is left to learn from.
+    """Counts the shards' restarts.
 
     Args:
         shards: Ray replaces their processes by itself.
-        min_steps: least number of stored steps to learn from.
-        start_over: called with the number of missing steps when fewer are left.
     """
 
-    def __init__(self, shards: Sequence[ShardHandle], min_steps: int, start_over: Callable[[int], None]) -> None:
-        self._shards, self._min_steps, self._start_over = shards, min_steps, start_over
+    def __init__(self, shards: Sequence[ShardHandle]) -> None:
+        self._shards = shards
         self._starts: dict[int, str] = {}
-        self._enough = False
         self.beats: dict[int, ShardBeat] = {}
         self.num_restarts = 0
-
-    @property
-    def num_steps(self) -> int:
-        """Steps stored in the shards that answer."""
-        return sum(beat.stats.num_steps for beat in self.beats.values())
 
     def tick(self, *, wait: bool = False) -> None:
         """Look at every shard once; with `wait` at what it is now, otherwise at what it last said."""
@@ -293,9 +285,3 @@ class ShardWatch:
             self.num_restarts += self._starts.get(shard.index, beat.starts) != beat.starts
             self._starts[shard.index] = beat.starts
             self.beats[shard.index] = beat
-        self._enough |= self.num_steps >= self._min_steps
-        all_answer = len(self.beats) == len(self._shards)
-        if self._enough and all_answer and self.num_steps < self._min_steps:
-            # The learner waits for the steps that are missing now, so the workers must not wait for the learner.
-            self._enough = False
-            self._start_over(self._min_steps - self.num_steps)

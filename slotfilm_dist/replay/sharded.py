@@ -15,6 +15,10 @@ from slotfilm_dist.replay.ledger import shard_of
 from slotfilm_dist.replay.shard import ReplayShard, generator_from
 
 
+class EmptyReplayError(ValueError):
+    """Nothing is stored in any shard."""
+
+
 def split_draws(
     rng: np.random.Generator, num_steps: Sequence[int], num_batches: int, batch_size: int
 ) -> Int64[np.ndarray, "batches shards"]:
@@ -27,11 +31,11 @@ def split_draws(
         batch_size: steps of each.
 
     Raises:
-        ValueError: nothing is stored anywhere.
+        EmptyReplayError: nothing is stored anywhere.
     """
     stored = np.asarray(num_steps, np.float64)
     if stored.sum() == 0:
-        raise ValueError("replay is empty: insert a block before sampling")
+        raise EmptyReplayError("replay is empty: insert a block before sampling")
     return rng.multinomial(batch_size, stored / stored.sum(), size=num_batches)
 
 
@@ -42,6 +46,17 @@ def join_batches(parts: Sequence[SampleBatch]) -> SampleBatch:
         return filled[0]
     names = [f.name for f in dataclasses.fields(SampleBatch)]
     return SampleBatch(**{name: np.concatenate([getattr(part, name) for part in filled]) for name in names})
+
+
+def cut(rows: SampleBatch, sizes: Int64[np.ndarray, " batches"]) -> list[SampleBatch]:
+    """The transitions in batches of these sizes, in their order, without a copy."""
+    ends = np.cumsum(sizes)
+    assert ends[-1] == len(rows.reward), "sizes add up to the rows"
+    columns = {f.name: getattr(rows, f.name) for f in dataclasses.fields(SampleBatch)}
+    return [
+        SampleBatch(**{name: column[end - size : end] for name, column in columns.items()})
+        for end, size in zip(ends, sizes, strict=True)
+    ]
 
 
 class ShardedReplay:

@@ -1,6 +1,7 @@
-"""The learner's two threads on a real hub and a real replay, without Ray."""
+"""The learner's threads on a real hub and a real replay, without Ray."""
 
 import math
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -12,6 +13,7 @@ import torch
 
 from slotfilm_dist.chaos.faulty_links import PoisonedReplay
 from slotfilm_dist.chaos.switches import Switches
+from slotfilm_dist.cluster import learning_loops
 from slotfilm_dist.cluster.hub import Hub, build_limiter
 from slotfilm_dist.cluster.learner_role import LearnerRole
 from slotfilm_dist.cluster.messages import BlockKey, BlockNotice
@@ -19,10 +21,11 @@ from slotfilm_dist.config import RunConfig
 from slotfilm_dist.envs.toy import ToyEnv
 from slotfilm_dist.learning.checkpoint import CheckpointStore, read_checkpoint
 from slotfilm_dist.learning.learner import dataset_hash, dataset_schema, learning_hash
-from slotfilm_dist.messages import TransitionBlock
+from slotfilm_dist.messages import SampleBatch, TransitionBlock
 from slotfilm_dist.policy import RandomPolicy
 from slotfilm_dist.presets import smoke
 from slotfilm_dist.replay.dataset_writer import FrameDatasetWriter
+from slotfilm_dist.replay.schema import ReplaySchema
 from slotfilm_dist.replay.shard import ReplayShard
 from slotfilm_dist.replay.sharded import ShardedReplay
 from slotfilm_dist.rollout import RolloutLoop
@@ -31,11 +34,29 @@ from slotfilm_dist.variants import apply_variant
 STEPS = 100
 
 
-class Store(ShardedReplay):
-    """Replay as a learner on a cluster sees it."""
+class Store:
+    """Replay as a learner on a cluster sees it: several threads may ask."""
+
+    def __init__(self, schema: ReplaySchema) -> None:
+        self._schema, self._lock = schema, threading.Lock()
+        self.lose()
+
+    def lose(self) -> None:
+        """Forget everything."""
+        with self._lock:
+            self._replay = ShardedReplay([ReplayShard(self._schema, 1000, 0, block_steps=16)], 0)
 
     def insert_all(self, blocks: Iterable[TransitionBlock]) -> int:
-        return sum(block.num_steps for block in blocks if self.insert(block))
+        with self._lock:
+            return sum(block.num_steps for block in blocks if self._replay.insert(block))
+
+    def sample(self, num_batches: int, batch_size: int) -> list[SampleBatch]:
+        with self._lock:
+            return self._replay.sample(num_batches, batch_size)
+
+    def num_steps(self) -> int:
+        with self._lock:
+            return self._replay.num_steps()
 
 
 class Bench:
@@ -51,7 +72,7 @@ class Bench:
         )
         self.checkpoints, self.switches = folder / "checkpoints", Switches(folder / "switches")
         self.hub = Hub(build_limiter(1.0, STEPS, 16), 1_000_000, 1)
-        self._dataset = folder / dataset_hash(self.config)
+        self.dataset = folder / dataset_hash(self.config)
         self._write_dataset()
         self._sequence = 0
         self.role = self.start(None)
@@ -60,10 +81,10 @@ class Bench:
     def start(self, resume_from: Path | None) -> LearnerRole:
         """A learner that is begun and connected."""
         role = LearnerRole(self.config, 7, torch.device("cpu"), self.hub)
-        beginning = role.begin(self._dataset, None, resume_from)
-        store = Store([ReplayShard(beginning.schema, 1000, 0, block_steps=16)], 0)
-        role.connect(PoisonedReplay(store, self.checkpoints.parent / "switches"))
-        assert role.refill(self._dataset) == STEPS
+        beginning = role.begin(self.dataset, None, resume_from)
+        self.store = Store(beginning.schema)
+        role.connect(PoisonedReplay(self.store, self.checkpoints.parent / "switches"))
+        assert role.refill(self.dataset) == STEPS
         return role
 
     def allow(self, num_blocks: int) -> None:
@@ -79,7 +100,7 @@ class Bench:
         env = ToyEnv(self.config, camera=False)
         loop = RolloutLoop(env, RandomPolicy(7, np.random.SeedSequence(0)), np.random.SeedSequence(1))
         name = dataset_hash(self.config)
-        with FrameDatasetWriter(self._dataset, dataset_schema(self.config, 7), name) as writer:
+        with FrameDatasetWriter(self.dataset, dataset_schema(self.config, 7), name) as writer:
             while writer.num_steps < STEPS:
                 writer.append(loop.collect(min(16, STEPS - writer.num_steps)))
             writer.finish()
@@ -136,6 +157,22 @@ def test_learner_without_a_checkpoint_says_why_it_stopped(bench: Bench) -> None:
     assert "there is no checkpoint to go back to" in bench.role.status().error
 
 
+def test_workers_fill_up_a_replay_that_was_lost(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learning_loops, "RESTORE_S", 0.3)
+    bench.role.start()
+    bench.allow(2)
+    until(lambda: bench.role.status().updates == 32, "32 updates")
+    bench.store.lose()
+    bench.allow(1)
+    until(lambda: "it holds 0" in bench.role.status().waiting_for, "a wait for steps")
+    bench.allow(5)  # more than the limiter's slack: the learner makes no update meanwhile
+    assert bench.role.status().updates == 32
+    bench.role.refill(bench.dataset)
+    bench.allow(4)
+    until(lambda: bench.role.status().updates > 32, "updates again")
+    assert not bench.role.status().error
+
+
 def test_best_is_what_was_evaluated_however_far_the_learner_is_by_then(bench: Bench) -> None:
     bench.role.start()
     bench.allow(1)
@@ -161,7 +198,7 @@ def test_passed_over_checkpoint_is_named_to_who_begins(bench: Bench) -> None:
     damaged.write_bytes(damaged.read_bytes()[:-1])
     version = bench.hub.newest_version()
     again = LearnerRole(bench.config, 7, torch.device("cpu"), bench.hub)
-    beginning = again.begin(bench._dataset, None, bench.checkpoints)
+    beginning = again.begin(bench.dataset, None, bench.checkpoints)
     assert beginning.values["updates"] == 16
     assert str(damaged) in beginning.problems[0]
     assert bench.hub.newest_version() > version
