@@ -1,6 +1,7 @@
 """The threads of a learner on a cluster: two fetch batches ahead, another updates and publishes weights."""
 
 import dataclasses
+import math
 import queue
 import threading
 import time
@@ -138,6 +139,7 @@ class LearningLoops:
         self._ready: queue.Queue[list[SampleBatch]] = queue.Queue(1)
         self._granted = self._made = 0
         self._counting = threading.Lock()
+        self._started_over_at = -math.inf
         self._counted = learner.updates
         self.waiting_for = self.error = ""
         self.waited_s = self.batch_wait_s = self.update_s = 0.0
@@ -204,10 +206,18 @@ class LearningLoops:
                 self.waiting_for = str(error)
             if stored < wanted and time.monotonic() - began > RESTORE_S:
                 self._give_back(made=0, granted=num_batches)
-                self._hub.start_over(wanted - stored)
+                self._start_over(wanted - stored, began)
                 return []
             self._stopping.wait(RETRY_S)
         return []
+
+    def _start_over(self, missing_steps: int, began: float) -> None:
+        """Have replay filled up, unless another fetcher has asked for that since this one began to wait."""
+        with self._counting:
+            if self._started_over_at > began:
+                return
+            self._started_over_at = time.monotonic()
+        self._hub.start_over(missing_steps)
 
     def _pass_on(self, batches: list[SampleBatch]) -> None:
         while batches and not self._stopping.is_set():

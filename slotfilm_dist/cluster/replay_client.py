@@ -153,13 +153,17 @@ class ReplayClient:
     """
 
     def __init__(self, shards: Sequence[ShardClient], seed: np.random.SeedSequence) -> None:
-        self._shards = list(shards)
+        self._shards, self._seed = list(shards), seed
         self._rng = np.random.default_rng(seed)
         self._choosing = threading.Lock()
         """Held while it is settled which shards to draw from; not while they are waited for."""
         self._sizes = [0] * len(shards)
         self._counts: dict[int, Any] = {}
         self._asked_at = [0.0] * len(shards)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """To another process it goes as new."""
+        return ReplayClient, (self._shards, self._seed)
 
     def insert(self, block: TransitionBlock) -> bool:
         """Store a block in its shard; False if it had been stored before."""
@@ -209,9 +213,9 @@ class ReplayClient:
                 return [join_batches(of_shards) for of_shards in zip(*parts, strict=True)]
 
     def num_steps(self) -> int:
-        """Steps stored in the shards that answer."""
+        """Steps stored in the shards that answer, as of half a second ago."""
         with self._choosing:
-            self._refresh(wait=sum(self._sizes) == 0)
+            self._refresh(wait=sum(self._sizes) == 0, ask_all=True)
             return sum(self._sizes)
 
     def _drawn(self, shard: ShardClient, request: Any) -> SampleBatch | None:
@@ -222,10 +226,10 @@ class ReplayClient:
             return None
         return rows
 
-    def _refresh(self, *, wait: bool) -> None:
-        """Ask shards that count as empty how much they hold."""
+    def _refresh(self, *, wait: bool, ask_all: bool = False) -> None:
+        """Ask shards that count as empty, or all, how much they hold."""
         deadline = time.monotonic() + (DRAW_S if wait else 0.0)
-        self._ask_empty()
+        self._ask(everyone=ask_all)
         while self._counts:
             for index, request in list(self._counts.items()):
                 try:
@@ -239,11 +243,11 @@ class ReplayClient:
                 return
             time.sleep(0.005)
 
-    def _ask_empty(self) -> None:
+    def _ask(self, *, everyone: bool) -> None:
         now = time.monotonic()
         for shard in self._shards:
             i = shard.index
-            if self._sizes[i] == 0 and i not in self._counts and now - self._asked_at[i] >= REFRESH_S:
+            if (everyone or self._sizes[i] == 0) and i not in self._counts and now - self._asked_at[i] >= REFRESH_S:
                 self._asked_at[i] = now
                 self._counts[i] = shard.begin_count()
 

@@ -168,7 +168,7 @@ def test_workers_fill_up_a_replay_that_was_lost(bench: Bench, monkeypatch: pytes
     bench.allow(5)  # more than the limiter's slack: the learner makes no update meanwhile
     assert bench.role.status().updates == 32
     bench.role.refill(bench.dataset)
-    bench.allow(4)
+    bench.allow(8)
     until(lambda: bench.role.status().updates > 32, "updates again")
     assert not bench.role.status().error
 

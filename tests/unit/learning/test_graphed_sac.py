@@ -140,7 +140,7 @@ def test_changed_rates_count_from_the_next_update(device: str) -> None:
     for i in range(8):
         learner.update(batch_of(i))
     learner.scale_rates(0.0)
-    before = {name: p.clone() for name, p in learner.critic.named_parameters()}
+    before = {name: p.detach().clone() for name, p in learner.critic.named_parameters()}
     for i in range(8):
         learner.update(batch_of(i))
     assert all(torch.equal(before[name], p) for name, p in learner.critic.named_parameters())
