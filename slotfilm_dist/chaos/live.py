@@ -19,6 +19,7 @@ from slotfilm_dist.chaos.faulty_links import faulty_wiring
 from slotfilm_dist.chaos.outcome import UnexpectedError
 from slotfilm_dist.chaos.switches import Switches
 from slotfilm_dist.cluster.backend import RayBackend
+from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
 from slotfilm_dist.cluster.worker import Limits
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.pipeline import Pipeline
@@ -29,6 +30,8 @@ from slotfilm_dist.stopping import Interrupted, StopFlag
 from slotfilm_dist.variants import apply_variant
 
 POLL_S = 0.05
+ANSWERS_S = 30.0
+"""Time for a process that was ended to be replaced, before the next one is."""
 STEP_LIMIT_S = 10.0
 """A step of the toy environment takes less than a millisecond, but an overloaded machine may stop for seconds."""
 SNAPSHOT_S = 10.0
@@ -159,10 +162,25 @@ class LiveRun:
         return self.until(lambda m: m["updates"] >= wanted, f"{count} more updates", timeout_s)
 
     def kill(self, *roles: str) -> None:
-        """End roles' processes with SIGKILL, one right after the other."""
-        ids = self.backend.process_ids()  # asked for once: a killed one does not answer
+        """End roles' processes with SIGKILL, one right after the other.
+
+        Raises:
+            UnexpectedError: some role had no process for `ANSWERS_S`.
+        """
+        ids = self._process_ids()  # asked for once: a killed one does not answer
         for role in roles:
             os.kill(ids[role], signal.SIGKILL)
+
+    def _process_ids(self) -> Mapping[str, int]:
+        """Of every role; one that an earlier fault ended may be about to be replaced."""
+        deadline = time.monotonic() + ANSWERS_S
+        while True:
+            try:
+                return self.backend.process_ids()
+            except (RoleLostError, RoleSilentError) as error:
+                if time.monotonic() > deadline:
+                    raise UnexpectedError(str(error)) from error
+                time.sleep(POLL_S)
 
     def longest_pause_s(self, since_s: float) -> float:
         """The longest time between two reports that show progress of the learner, from `since_s` on."""
