@@ -12,7 +12,6 @@ from jaxtyping import Float, UInt8
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
-from torchvision.models import ResNet18_Weights, resnet18
 
 from slotfilm_dist.config import EncoderConfig
 
@@ -31,7 +30,8 @@ _COUNTER = "num_batches_tracked"
 class Backbone(nn.Module):
     """ResNet-18 truncated after its third stage: 2,782,784 parameters, stride 16, 256 channels.
 
-    Parameters carry torchvision's names below `trunk.`. Everything is kept in the channels-last layout, in which a
+    Parameters carry torchvision's names below `trunk.`. It is built here, because to import torchvision takes a process as
+    long as to import torch, and every worker that is replaced would wait for that. Everything is kept in the channels-last layout, in which a
     picture already is when its colour axis comes last, so that no copy is made on the way in or out.
     """
 
@@ -41,9 +41,7 @@ class Backbone(nn.Module):
     def __init__(self, generator: torch.Generator) -> None:
         super().__init__()
         with torch.device("meta"):
-            net = resnet18(weights=None)
-        stages = ("conv1", "bn1", "relu", "maxpool", "layer1", "layer2", "layer3")
-        self.trunk = nn.Sequential(OrderedDict((name, getattr(net, name)) for name in stages))
+            self.trunk = _trunk()
         self.trunk.to_empty(device="cpu")
         for module in self.trunk.modules():
             if isinstance(module, nn.Conv2d):
@@ -59,6 +57,44 @@ class Backbone(nn.Module):
         """The feature map, cell by cell, row by row; the picture is normalised here and nowhere else."""
         picture = rgb.permute(0, 3, 1, 2).to(self.scale.dtype).mul_(self.scale).add_(self.shift)
         return self.trunk(picture).permute(0, 2, 3, 1).flatten(1, 2)
+
+
+class _Block(nn.Module):
+    """Two convolutions around which the input is added (He et al. 2016), with torchvision's names and order."""
+
+    def __init__(self, channels_in: int, channels: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels_in, channels, 3, stride, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(channels)
+        self.relu = nn.ReLU(inplace=True)
+        self.conv2 = nn.Conv2d(channels, channels, 3, 1, 1, bias=False)
+        self.bn2 = nn.BatchNorm2d(channels)
+        self.downsample: nn.Module | None = None
+        if stride > 1:
+            self.downsample = nn.Sequential(
+                nn.Conv2d(channels_in, channels, 1, stride, bias=False), nn.BatchNorm2d(channels)
+            )
+
+    def forward(self, x: Float[Tensor, "batch channels height width"]) -> Float[Tensor, "batch out height2 width2"]:
+        """The block's output."""
+        out = self.relu(self.bn1(self.conv1(x)))
+        out = self.bn2(self.conv2(out))
+        out += x if self.downsample is None else self.downsample(x)
+        return self.relu(out)
+
+
+def _trunk() -> nn.Sequential:
+    """ResNet-18 as torchvision builds it, up to its third stage."""
+    stages: list[tuple[str, nn.Module]] = [
+        ("conv1", nn.Conv2d(3, 64, 7, 2, 3, bias=False)),
+        ("bn1", nn.BatchNorm2d(64)),
+        ("relu", nn.ReLU(inplace=True)),
+        ("maxpool", nn.MaxPool2d(3, 2, 1)),
+    ]
+    for number, (before, channels) in enumerate(((64, 64), (64, 128), (128, FEATURE_CHANNELS)), start=1):
+        first = _Block(before, channels, stride=1 if before == channels else 2)
+        stages.append((f"layer{number}", nn.Sequential(first, _Block(channels, channels, stride=1))))
+    return nn.Sequential(OrderedDict(stages))
 
 
 def load_initial_weights(backbone: Backbone, config: EncoderConfig) -> None:
@@ -89,6 +125,8 @@ def weights_hash(named: Iterable[tuple[str, Tensor]]) -> str:
 
 
 def _download_imagenet() -> Mapping[str, Any]:
+    from torchvision.models import ResNet18_Weights
+
     try:
         return ResNet18_Weights.IMAGENET1K_V1.get_state_dict(progress=False, check_hash=True)
     except (OSError, RuntimeError) as error:
