@@ -15,7 +15,7 @@ from torch import Tensor
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.learning import losses
 from slotfilm_dist.learning.lean_adam import LeanAdam, pieces
-from slotfilm_dist.learning.off_policy import MAX_SKIPPED, METRICS_EVERY, TrainingDivergedError
+from slotfilm_dist.learning.off_policy import MAX_SKIPPED, METRICS_EVERY, TrainingDivergedError, gradient_norm
 from slotfilm_dist.learning.sac import ADVICE, BATCH_FIELDS, SacLearner, annealed_temperature
 from slotfilm_dist.messages import SampleBatch
 from slotfilm_dist.nets.agent import AgentEncoder
@@ -147,12 +147,7 @@ class GraphedSac(SacLearner):
         optimiser.zero_grad()
         loss.backward()
         parameters = [p for group in optimiser.param_groups for p in group["params"]]
-        if clip:
-            norm = torch.nn.utils.clip_grad_norm_(parameters, clip)
-        else:
-            norm = torch.linalg.vector_norm(
-                torch.stack(torch._foreach_norm(pieces([p.grad for p in parameters if p.grad is not None])))
-            )  # pyright: ignore[reportPrivateImportUsage]
+        norm = torch.nn.utils.clip_grad_norm_(parameters, clip) if clip else gradient_norm(parameters, cut=pieces)
         failed = failed | ~torch.isfinite(loss.detach() + norm)
         optimiser.found_inf = failed.float()
         optimiser.step()

@@ -3,7 +3,7 @@
 import abc
 import hashlib
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -185,12 +185,19 @@ class OffPolicyLearner(abc.ABC, Generic[ActorT]):
             return torch.from_numpy(array).to(self.device, non_blocking=True)
 
 
-def gradient_norm(parameters: Iterable[Tensor]) -> Float[Tensor, ""]:
-    """L2 norm of all gradients together; 0 where there is none."""
+def gradient_norm(
+    parameters: Iterable[Tensor], cut: Callable[[list[Tensor]], list[Tensor]] = list
+) -> Float[Tensor, ""]:
+    """L2 norm of all gradients together; 0 where there is none.
+
+    Args:
+        parameters: whose gradients.
+        cut: makes other tensors of the same numbers of them, for a GPU to work on side by side.
+    """
     gradients = [p.grad for p in parameters if p.grad is not None]
     if not gradients:
         return torch.zeros(())
-    norms = torch._foreach_norm(gradients)  # pyright: ignore[reportPrivateImportUsage]
+    norms = torch._foreach_norm(cut(gradients))  # pyright: ignore[reportPrivateImportUsage]
     return torch.linalg.vector_norm(torch.stack(norms))
 
 

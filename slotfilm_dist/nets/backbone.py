@@ -30,9 +30,10 @@ _COUNTER = "num_batches_tracked"
 class Backbone(nn.Module):
     """ResNet-18 truncated after its third stage: 2,782,784 parameters, stride 16, 256 channels.
 
-    Parameters carry torchvision's names below `trunk.`. It is built here, because to import torchvision takes a process as
-    long as to import torch, and every worker that is replaced would wait for that. Everything is kept in the channels-last layout, in which a
-    picture already is when its colour axis comes last, so that no copy is made on the way in or out.
+    Parameters carry torchvision's names below `trunk.`. It is built here, because to import torchvision takes a process
+    as long as to import torch, and every worker that is replaced would wait for that. Everything is kept in the
+    channels-last layout, in which a picture already is when its colour axis comes last, so that no copy is made on the
+    way in or out.
     """
 
     scale: Tensor
