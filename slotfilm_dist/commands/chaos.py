@@ -1,5 +1,6 @@
 """`slotfilm chaos`: damages a real run on purpose and says what followed."""
 
+import contextlib
 import signal
 import sys
 import tempfile
@@ -42,7 +43,8 @@ def main(arguments: Sequence[str]) -> int:
 
     signal.signal(signal.SIGTERM, _leave)
     environment, outcomes = "simulator" if options.simulator else "toy", list[Outcome]()
-    with tempfile.TemporaryDirectory(prefix="chaos-") as scratch:
+    # Ray tells of dead processes on standard output, which is the table's.
+    with tempfile.TemporaryDirectory(prefix="chaos-") as scratch, contextlib.redirect_stdout(sys.stderr):
         folder = Path(options.keep or scratch)
         if options.soak:
             outcomes.append(soak(folder, options.soak, options.seed, environment))
