@@ -246,21 +246,23 @@ class LocalBackend:
 
     def _update(self, batch: SampleBatch) -> None:
         """One update that is due; what a return to a checkpoint loses is due again."""
-        learner = self._trained()
-        before = learner.updates
         try:
-            learner.update(batch)
+            self._trained().update(batch)
         except TrainingDivergedError as error:
             try:
                 lost = self._recovery.roll_back(error)
             except TrainingDivergedError as final:
                 raise RunFailedError(f"the learner stopped: {final}; go on with --resume") from final
             _logger.warning("%s; went back by %d updates, with half the rates", error, lost)
-            if lost:
-                self._limiter.refund_update(lost)
-            return
-        if learner.updates > before:
-            self._limiter.try_update(1)
+        self._count_updates()
+
+    def _count_updates(self) -> None:
+        """Bring the limiter to the learner's count, which falls where updates are lost or prove to have been skipped."""
+        made = self._trained().updates - self._limiter.updates
+        if made > 0:
+            self._limiter.try_update(made)
+        elif made < 0:
+            self._limiter.refund_update(-made)
 
     def _metrics(self) -> dict[str, float]:
         return self._trained().metrics() | {
@@ -286,6 +288,8 @@ class LocalBackend:
     def save(self, folder: Path, values: Mapping[str, Any], *, with_replay: bool, best: bool = False) -> int:
         """Write a checkpoint, and replay beside it."""
         learner = self._trained()
+        learner.settle()
+        self._count_updates()
         own = {"limiter": self._limiter.save(), "rollout": self._loop.save(), "noise": self._policy.save_noise()}
         checkpoint = learner.checkpoint(own | dict(values))
         store = CheckpointStore(folder, self._config.checkpoint.keep)
