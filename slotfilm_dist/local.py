@@ -257,7 +257,7 @@ class LocalBackend:
         self._count_updates()
 
     def _count_updates(self) -> None:
-        """Bring the limiter to the learner's count, which falls where updates are lost or prove to have been skipped."""
+        """Bring the limiter to the learner's count, which falls where updates are lost or turn out skipped."""
         made = self._trained().updates - self._limiter.updates
         if made > 0:
             self._limiter.try_update(made)
