@@ -254,15 +254,7 @@ class LocalBackend:
             except TrainingDivergedError as final:
                 raise RunFailedError(f"the learner stopped: {final}; go on with --resume") from final
             _logger.warning("%s; went back by %d updates, with half the rates", error, lost)
-        self._count_updates()
-
-    def _count_updates(self) -> None:
-        """Bring the limiter to the learner's count, which falls where updates are lost or turn out skipped."""
-        made = self._trained().updates - self._limiter.updates
-        if made > 0:
-            self._limiter.try_update(made)
-        elif made < 0:
-            self._limiter.refund_update(-made)
+        self._limiter.set_updates(self._trained().updates)
 
     def _metrics(self) -> dict[str, float]:
         return self._trained().metrics() | {
@@ -289,7 +281,7 @@ class LocalBackend:
         """Write a checkpoint, and replay beside it."""
         learner = self._trained()
         learner.settle()
-        self._count_updates()
+        self._limiter.set_updates(learner.updates)
         own = {"limiter": self._limiter.save(), "rollout": self._loop.save(), "noise": self._policy.save_noise()}
         checkpoint = learner.checkpoint(own | dict(values))
         store = CheckpointStore(folder, self._config.checkpoint.keep)

@@ -194,6 +194,13 @@ class RateLimiter:
             self._updates -= num_updates
             self._changed.notify_all()
 
+    def set_updates(self, num_updates: int) -> None:
+        """Take over the learner's own count, which falls where updates are lost or turn out to have been skipped."""
+        check(num_updates >= 0, "num_updates", num_updates, "must be 0 or more")
+        with self._changed:
+            self._updates = num_updates
+            self._changed.notify_all()
+
     def close(self) -> None:
         """Send everyone who waits home, and grant nothing more."""
         with self._changed:

@@ -258,3 +258,15 @@ def test_impossible_settings_are_refused_by_field(field, value):
     settings = {"updates_per_step": 1.0, "min_steps": 0, "slack_updates": 1, "slack_steps": 64}
     with pytest.raises(ValueError, match=field):
         RateLimiter(**settings | {field: value})
+
+
+def test_the_learners_own_count_makes_skipped_updates_due_again() -> None:
+    limiter = RateLimiter(1.0, 0, slack_updates=0, slack_steps=20)
+    limiter.start_learning(0)
+    limiter.try_insert(10)
+    limiter.set_updates(10)
+    assert limiter.updates_owed() == 0
+    limiter.set_updates(7)
+    assert limiter.updates_owed() == 3
+    with pytest.raises(ValueError, match="num_updates = -1"):
+        limiter.set_updates(-1)
