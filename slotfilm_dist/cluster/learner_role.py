@@ -21,7 +21,7 @@ UNFINISHED = ".unfinished"
 
 
 class LearnerRole:
-    """Holds the learner; `start` begins the two threads of `LearningLoops`, `stop` ends them.
+    """Holds the learner; `start` begins the threads of `LearningLoops`, `stop` ends them.
 
     Args:
         config: the run.

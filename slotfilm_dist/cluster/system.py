@@ -15,9 +15,9 @@
     loop       consumes         produces          waits for                       stops
     worker     actions          blocks            room in its sender              between two steps
     follower   weights          an acting policy  a newer version                 within a second
-    batcher    observations     tokens, actions   a request; others, 5 ms         with its process
+    batcher    observations     tokens, actions   a request; on a CPU others too  with its process
     sender     blocks           stored blocks     the limiter; a shard's answer   after its block
-    fetcher    grants, replay   chunks            the limiter; replay's size      within half a second
+    2 fetchers grants, replay   chunks            the limiter; replay's size      within half a second
     updater    chunks           updates, weights  a chunk                         after its update
     caretaker  beats            restarts          nothing                         within a quarter second
 

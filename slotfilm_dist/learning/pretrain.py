@@ -84,7 +84,8 @@ class Pretrainer:
         self._trained = self._trained_parameters()
         on_gpu = self.device.type == "cuda"
         self._optimizer = torch.optim.Adam(self._trained.values(), lr=config.lr, fused=True, capturable=on_gpu)
-        self._descend = Capture(self._take_step, self.device) if cuda_graphs else self._take_step
+        self._cuda_graphs = cuda_graphs
+        self._record_anew()
         self._losses = torch.full((4,), math.nan)
 
     def step(self) -> dict[str, float]:
@@ -198,6 +199,11 @@ class Pretrainer:
         for name, moments in state["adam"].items():
             self._optimizer.state[self._trained[name]] = self._adam_state(self._trained[name], moments)
         self._rows = None
+        self._record_anew()
+
+    def _record_anew(self) -> None:
+        """Forget the step's graph, which holds the optimiser's tensors."""
+        self._descend = Capture(self._take_step, self.device) if self._cuda_graphs else self._take_step
 
     def _adam_state(self, parameter: nn.Parameter, moments: Mapping[str, Any]) -> dict[str, Tensor]:
         """Adam's state in the parameter's own memory layout, which its fused kernel takes for granted."""
@@ -214,8 +220,7 @@ class Pretrainer:
         return {name: value for name, value in named.items() if with_backbone or not name.startswith("backbone.")}
 
     def _perceive(self, seen: Shaped[Tensor, "batch ..."], *, training: bool) -> Perception:
-        """The network's view of some frames, as `_seen` gives them; with a trained backbone BatchNorm follows
-        `training`."""
+        """The network's view of frames as `_seen` gives them; BatchNorm of a trained backbone follows `training`."""
         rows = self._all_rows().on_device(seen)
         with torch.autocast(self.device.type, torch.bfloat16, self._half, cache_enabled=False):
             if self.config.train_backbone == "all":
@@ -239,8 +244,8 @@ class Pretrainer:
     def _all_rows(self) -> Rows:
         """The pictures, or the unchanging backbone's features of every frame, computed at the first call."""
         if self._rows is None:
-            pictures = Rows(self.frames.rgb, self.device)
-            self._rows = pictures if self.config.train_backbone == "all" else Rows(self._features(), self.device)
+            whole = self.config.train_backbone == "all"
+            self._rows = Rows(self.frames.rgb if whole else self._features(), self.device)
         return self._rows
 
     @torch.no_grad()
