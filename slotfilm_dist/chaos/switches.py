@@ -40,7 +40,9 @@ class Switches:
         """The amount of a fault that happens now and once, None if none is armed."""
         for entry in self._entries():
             if entry.startswith(name + ".") and TAKEN not in entry:
-                return self._claim(entry, keep=False)
+                amount = self._claim(entry, keep=False)
+                if amount is not None:  # else another thread was faster: the next one is still to be had
+                    return amount
         return None
 
     def lasting(self, name: str) -> float | None:
