@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from slotfilm_dist.commands.options import FIELDS_NOTE, Parser, build_config, parse_with_fields
+from slotfilm_dist.commands.options import FIELDS_NOTE, Parser, build_config, check_weights_file, parse_with_fields
 from slotfilm_dist.config import CheckpointConfig, RunConfig, RuntimeConfig, changed_fields, config_hash
 from slotfilm_dist.presets import PRESETS, preset_named
 
@@ -35,6 +35,7 @@ def main(arguments: Sequence[str]) -> int:
     if options.max_concurrent < 0:
         raise ValueError(f"--max-concurrent {options.max_concurrent}: must be 0 or more; 0 is as many as fit")
     base = build_config(options.preset, "slotfilm", fields, show_fields=options.fields)
+    check_weights_file(base)
 
     from slotfilm_dist.tuning.grid_file import write_grid_file
     from slotfilm_dist.tuning.jobs import build_jobs, build_trials, select_variants

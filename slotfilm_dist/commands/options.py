@@ -5,9 +5,11 @@ import contextlib
 import dataclasses
 import difflib
 import io
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import NoReturn
 
 from slotfilm_dist.config import RunConfig
@@ -101,6 +103,20 @@ def change_fields(base: RunConfig, fields: Sequence[str]) -> RunConfig:
         if stop.code in (0, None):
             raise
         raise ValueError(_refusal(fields, shown.getvalue())) from None
+
+
+def check_weights_file(config: RunConfig) -> None:
+    """Find out before anything heavy is imported or started whether the file of initial weights is there.
+
+    On the cluster of `RAY_ADDRESS` the file lies where the learner runs, which looks for it itself.
+
+    Raises:
+        ValueError: there is no such file.
+    """
+    encoder = config.encoder
+    if encoder.backbone == "path" and encoder.uses_image and not os.environ.get("RAY_ADDRESS"):
+        if not Path(encoder.backbone_path).is_file():
+            raise ValueError(f"encoder.backbone_path = {encoder.backbone_path!r}: there is no such file")
 
 
 def _refusal(fields: Sequence[str], shown: str) -> str:

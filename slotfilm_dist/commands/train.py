@@ -12,6 +12,7 @@ from slotfilm_dist.commands.options import (
     add_config_options,
     build_config,
     change_fields,
+    check_weights_file,
     parse_with_fields,
 )
 from slotfilm_dist.commands.scale import AUTO, workers_wanted
@@ -73,6 +74,8 @@ def _resumed_config(path: Path, fields: Sequence[str]) -> RunConfig:
 
 
 def _execute(path: Path, config: RunConfig, artifacts: Path, *, as_json: bool) -> int:
+    check_weights_file(config)
+
     from slotfilm_dist.driver import drive
 
     with contextlib.redirect_stdout(sys.stderr):  # Ray's messages keep out of --json

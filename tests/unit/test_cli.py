@@ -46,6 +46,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (("train", "--sac.gamma", "high"), "sac.gamma"),
         (("train", "--sac.gamma"), "sac.gamma"),
         (("train", "--runtime.mode", "rya"), "runtime.mode"),
+        (("train", "smoke", "--encoder.backbone", "path", "--encoder.backbone_path", "x.pt"), "x.pt': there is no such"),
+        (("grid", "smoke", "--encoder.backbone", "path", "--encoder.backbone_path", "x.pt"), "x.pt': there is no such"),
         (("train", "quick", "extra"), "extra"),
         (("train", "smoke", "--workers", "many"), "--workers: many: must be 1 or more, or auto"),
         (("scale", "nowhere", "--workers", "0"), "--workers: 0: must be 1 or more, or auto"),

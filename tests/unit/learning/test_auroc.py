@@ -15,5 +15,6 @@ def test_auroc_is_the_share_of_pairs_in_the_right_order() -> None:
     assert auroc(scores, labels) == pytest.approx(np.mean(above))
 
 
-def test_auroc_without_a_class_is_undefined() -> None:
+def test_auroc_without_a_class_or_with_an_undefined_score_is_undefined() -> None:
     assert math.isnan(auroc(np.arange(3.0), np.ones(3, dtype=bool)))
+    assert math.isnan(auroc(np.array([0.0, math.nan]), np.array([True, False])))
