@@ -21,7 +21,8 @@ FIELDS += ["--env.max_steps", "20", "--evaluation.episodes", "1", "--evaluation.
 FIELDS += ["--checkpoint.every_updates", "100", "--runtime.mode", "local", "--runtime.metrics_port", "0"]
 HEAD = (
     "ray start --head --node-ip-address=127.0.0.1 --port={} --dashboard-host=127.0.0.1 --dashboard-port={} "
-    "--metrics-export-port={} --num-cpus=2 --object-store-memory=200000000 --disable-usage-stats --block"
+    "--metrics-export-port={} --dashboard-agent-listen-port={} "
+    "--num-cpus=2 --object-store-memory=200000000 --disable-usage-stats --block"
 )
 
 
@@ -78,9 +79,9 @@ class Jobs:
 
 @pytest.fixture
 def jobs(home: Any) -> Jobs:
-    gcs, dashboard, metrics = home.free_ports(3)
+    gcs, dashboard, metrics, agent = home.free_ports(4)
     ray = str(Path(sys.executable).with_name("ray"))
-    command = HEAD.format(gcs, dashboard, metrics).replace("ray ", f"{ray} ", 1) + f" --temp-dir={home.folder}"
+    command = HEAD.format(gcs, dashboard, metrics, agent).replace("ray ", f"{ray} ", 1) + f" --temp-dir={home.folder}"
     home.start(command, RAY_AUTH_MODE="token", RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER="0")
     home.wait("dashboard", lambda: home.get(f"http://127.0.0.1:{dashboard}/api/version", home.token)[0] == 200)
     return Jobs(home, dashboard)
