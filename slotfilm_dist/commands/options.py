@@ -114,9 +114,9 @@ def check_weights_file(config: RunConfig) -> None:
         ValueError: there is no such file.
     """
     encoder = config.encoder
-    if encoder.backbone == "path" and encoder.uses_image and not os.environ.get("RAY_ADDRESS"):
-        if not Path(encoder.backbone_path).is_file():
-            raise ValueError(f"encoder.backbone_path = {encoder.backbone_path!r}: there is no such file")
+    wanted = encoder.backbone == "path" and encoder.uses_image and not os.environ.get("RAY_ADDRESS")
+    if wanted and not Path(encoder.backbone_path).is_file():
+        raise ValueError(f"encoder.backbone_path = {encoder.backbone_path!r}: there is no such file")
 
 
 def _refusal(fields: Sequence[str], shown: str) -> str:

@@ -7,7 +7,10 @@ from jaxtyping import Bool, Float
 
 
 def auroc(scores: Float[np.ndarray, " samples"], labels: Bool[np.ndarray, " samples"]) -> float:
-    """Chance that a positive sample scores above a negative one, ties counting half; NaN if a class is missing or a score is NaN."""
+    """Chance that a positive sample scores above a negative one, ties counting half.
+
+    NaN if a class is missing or a score is NaN.
+    """
     num_positive = int(labels.sum())
     num_negative = len(labels) - num_positive
     if num_positive == 0 or num_negative == 0 or np.isnan(scores).any():

@@ -24,6 +24,9 @@ def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return told.err
 
 
+NO_WEIGHTS = ("--encoder.backbone", "path", "--encoder.backbone_path", "nothing.pt")
+
+
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
@@ -46,8 +49,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (("train", "--sac.gamma", "high"), "sac.gamma"),
         (("train", "--sac.gamma"), "sac.gamma"),
         (("train", "--runtime.mode", "rya"), "runtime.mode"),
-        (("train", "smoke", "--encoder.backbone", "path", "--encoder.backbone_path", "x.pt"), "x.pt': there is no such"),
-        (("grid", "smoke", "--encoder.backbone", "path", "--encoder.backbone_path", "x.pt"), "x.pt': there is no such"),
+        (("train", "smoke", *NO_WEIGHTS), "'nothing.pt': there is no such file"),
+        (("grid", "smoke", *NO_WEIGHTS), "'nothing.pt': there is no such file"),
         (("train", "quick", "extra"), "extra"),
         (("train", "smoke", "--workers", "many"), "--workers: many: must be 1 or more, or auto"),
         (("scale", "nowhere", "--workers", "0"), "--workers: 0: must be 1 or more, or auto"),
