@@ -109,12 +109,12 @@ def _with_state(pixels: RunConfig) -> RunConfig:
 
 
 def varpi_1(base: RunConfig) -> RunConfig:
-    """A flatter stability term (Figure 11)."""
+    """Sharpness 1 of the stability term, where the paper has 5 (Figure 11)."""
     return replace(base, reward=replace(base.reward, varpi=1.0))
 
 
 def varpi_10(base: RunConfig) -> RunConfig:
-    """A sharper stability term (Figure 11)."""
+    """Sharpness 10 of the stability term, where the paper has 5 (Figure 11)."""
     return replace(base, reward=replace(base.reward, varpi=10.0))
 
 
