@@ -5,8 +5,8 @@
         -- python jobs/grid.py steady --seeds 5 --gpus-per-trial 0.25 --runs /shared/runs --artifacts /shared/artifacts
 
 `/shared` stands for a directory that every node sees. All words go to `slotfilm grid`; `--dry-run` among them says
-what would be done. A variant changes the preset's agent: the ablations of the reward (`varpi_1`, `varpi_10`, `no_static`)
-are the paper's on `paper`; `steady` rewards standing still in its own way.
+what would be done. A variant changes the preset's agent: the ablations of the reward (`varpi_1`, `varpi_10`,
+`no_static`) are the paper's on `paper`; `steady` rewards standing still in its own way.
 
 The same submission again (under another submission id) goes on: finished trials are left alone, interrupted ones
 continue from their checkpoints. `ray job stop` sends SIGTERM, on which every trial writes its checkpoint with replay;

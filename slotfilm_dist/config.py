@@ -232,6 +232,9 @@ class EncoderConfig:
     """Initial ResNet-18 weights: torchvision's ImageNet download, a file, or random. Never falls back silently."""
     backbone_path: str = ""
     """ResNet-18 weights for `backbone = path`: .safetensors, or a torch state dict (loaded with weights_only)."""
+    frozen_precision: Literal["float32", "bfloat16", "auto"] = "float32"
+    """Arithmetic of the frozen backbone on a CPU: bfloat16 takes two thirds of the time where the processor has it, and
+    the tokens lose their third digit; `auto` takes it there and float32 elsewhere."""
     feature_dim: int = 42
     """Channels D of tokens, slots and FiLM; what a pixel encoder's convolutions are projected to."""
     num_heads: int = 3

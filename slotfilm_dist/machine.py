@@ -1,4 +1,4 @@
-"""How many cores and how much memory this process may use, seen through a container's limits."""
+"""What this process has: cores and memory, seen through a container's limits, and the processor's arithmetic."""
 
 import math
 import os
@@ -18,6 +18,16 @@ def usable_cores(control_groups: Path = CONTROL_GROUPS) -> float:
     cores = float(len(os.sched_getaffinity(0)))
     # A quota of -1 is none.
     return min(cores, quota / period) if 0 < quota < math.inf and 0 < period < math.inf else cores
+
+
+def has_bfloat16(processors: Path = Path("/proc/cpuinfo")) -> bool:
+    """Whether the processor multiplies bfloat16 numbers itself (AVX-512 BF16 or AMX)."""
+    try:
+        text = processors.read_text(encoding="utf-8")
+    except OSError:
+        return False
+    flags = next((line for line in text.splitlines() if line.startswith("flags")), "").split()
+    return not {"avx512_bf16", "amx_bf16"}.isdisjoint(flags)
 
 
 def usable_memory_bytes(control_groups: Path = CONTROL_GROUPS) -> int:

@@ -54,7 +54,7 @@ def laptop() -> RunConfig:
         base,
         env=replace(base.env, max_steps=100),
         sac=replace(base.sac, annealing_updates=100_000),
-        encoder=replace(base.encoder, backbone="random"),
+        encoder=replace(base.encoder, backbone="random", frozen_precision="auto"),
         pretrain=replace(base.pretrain, steps=6_000, batch_size=64, lr=1e-3, train_backbone="none"),
         schedule=replace(base.schedule, total_steps=300_000, random_steps=20_000, updates_per_step=0.5),
         replay=replace(base.replay, capacity=300_000),

@@ -88,6 +88,8 @@ def export_policy(
 ) -> dict[str, ExportedFile]:
     """Write the policy of a run's checkpoint, load it back, compare it with the agent and time it.
 
+    It computes in float32 throughout, whatever `encoder.frozen_precision` the agent acted with.
+
     Args:
         run: directory of the run.
         out: directory to write; an exported policy that is there is replaced as a whole.
@@ -107,7 +109,8 @@ def export_policy(
         )
     config = load_config(run / "config.json")
     found = _read(run / "checkpoints", config, checkpoint)
-    learner = Learner(config, _action_dim(config, found), torch.device("cpu"), fetch_weights=False)
+    exact = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, frozen_precision="float32"))
+    learner = Learner(exact, _action_dim(config, found), torch.device("cpu"), fetch_weights=False)
     learner.load_checkpoint(found)
     inputs = policy_inputs(config)
     agent = ExportedAgent(learner.encoder, learner.rl.actor, tuple(inputs), config.obs.state_dim).eval()

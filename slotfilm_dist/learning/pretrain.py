@@ -255,7 +255,7 @@ class Pretrainer:
         features = np.empty((len(rgb), self.network.grid_size**2, FEATURE_CHANNELS), np.float16)
         for chosen in _batches(np.arange(len(rgb))):
             pictures = torch.from_numpy(np.asarray(rgb[chosen])).to(self.device)
-            features[chosen] = self.network.backbone(pictures).half().cpu().numpy()
+            features[chosen] = self.network.frozen_features(pictures).half().cpu().numpy()
         return features
 
 

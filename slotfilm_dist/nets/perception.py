@@ -8,6 +8,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from slotfilm_dist.config import EncoderConfig
+from slotfilm_dist.machine import has_bfloat16
 from slotfilm_dist.nets.attention import FoldedSlotAttention
 from slotfilm_dist.nets.backbone import FEATURE_CHANNELS, STRIDE, Backbone
 from slotfilm_dist.nets.initialization import seeded_head, seeded_linear, seeded_normal
@@ -40,6 +41,7 @@ class PerceptionNetwork(nn.Module):
         self.pos_scale, self.matched_visibility = config.pos_scale, config.vis_head == "matched"
         self.frozen = False
         """Backbone and projection never change again, and BatchNorm stays in eval mode."""
+        self._half = config.frozen_precision == "bfloat16" or (config.frozen_precision == "auto" and has_bfloat16())
         self.backbone = Backbone(generator)
         self.projection = seeded_linear(FEATURE_CHANNELS, dim, generator)
         self.row_code = seeded_normal(self.grid_size, dim // 2, generator=generator)
@@ -51,7 +53,14 @@ class PerceptionNetwork(nn.Module):
 
     def tokens(self, rgb: UInt8[Tensor, "batch height width 3"]) -> Float[Tensor, "batch tokens dim"]:
         """The projected feature map, before the positional code: all that a frozen backbone contributes."""
-        return self.projection(self.backbone(rgb))
+        return self.projection(self.frozen_features(rgb) if self.frozen else self.backbone(rgb))
+
+    def frozen_features(self, rgb: UInt8[Tensor, "batch height width 3"]) -> Float[Tensor, "batch tokens channels"]:
+        """What a backbone that does not change makes of pictures, in `encoder.frozen_precision`."""
+        if not self._half or rgb.is_cuda:
+            return self.backbone(rgb)
+        with torch.autocast("cpu", torch.bfloat16, cache_enabled=False):
+            return self.backbone(rgb).float()
 
     def code(self) -> Float[Tensor, "tokens dim"]:
         """The scaled positional code lambda P of every token."""

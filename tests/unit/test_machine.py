@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from slotfilm_dist.machine import usable_cores, usable_memory_bytes
+from slotfilm_dist.machine import has_bfloat16, usable_cores, usable_memory_bytes
 
 
 @pytest.mark.parametrize("name", ["memory.max", "memory/memory.limit_in_bytes"])
@@ -42,3 +42,21 @@ def test_without_a_cpu_quota_the_cores_count(tmp_path: Path, text: str | None) -
     if text is not None:
         (tmp_path / "cpu.max").write_text(text)
     assert usable_cores(tmp_path) == len(os.sched_getaffinity(0))
+
+
+@pytest.mark.parametrize(
+    ("text", "has"),
+    [
+        ("processor : 0\nflags\t\t: fpu avx512f avx512_bf16\n", True),
+        ("flags : fpu amx_bf16 amx_tile\n", True),
+        ("flags : fpu avx2 avx512f\n", False),
+        ("Features : asimd bf16\n", False),
+    ],
+)
+def test_bfloat16_is_known_by_the_processor_s_flags(tmp_path: Path, text: str, has: bool) -> None:
+    (tmp_path / "cpuinfo").write_text(text)
+    assert has_bfloat16(tmp_path / "cpuinfo") is has
+
+
+def test_processor_that_says_nothing_has_no_bfloat16(tmp_path: Path) -> None:
+    assert not has_bfloat16(tmp_path / "nothing")

@@ -55,7 +55,7 @@ def tiny(variant: str) -> RunConfig:
         config,
         env=replace(config.env, image_size=64),
         obs=replace(config.obs, normalize_state=True),
-        encoder=replace(config.encoder, backbone="random"),
+        encoder=replace(config.encoder, backbone="random", frozen_precision="float32"),
         sac=replace(config.sac, hidden=(32, 32)),
         ddpg=replace(config.ddpg, hidden=(32, 32)),
     )

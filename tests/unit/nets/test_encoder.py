@@ -124,6 +124,19 @@ def test_replay_keeps_tokens_only_of_a_frozen_backbone() -> None:
     assert blind.to_visual(pictures()).shape == (3, 0)
 
 
+def test_frozen_backbone_in_bfloat16_gives_nearly_the_same_tokens() -> None:
+    exact, half = build().eval(), build(frozen_precision="bfloat16").eval()
+    wanted, given = exact.tokens(pictures()), half.tokens(pictures())
+    assert given.dtype == torch.float32
+    assert 0 < (given - wanted).norm() / wanted.norm() < 0.02
+    assert half.backbone_hash() == exact.backbone_hash()
+
+
+def test_only_a_frozen_backbone_works_in_bfloat16() -> None:
+    exact, half = build(frozen=False).eval(), build(frozen=False, frozen_precision="bfloat16").eval()
+    assert torch.equal(half.tokens(pictures()), exact.tokens(pictures()))
+
+
 def test_training_mode_never_reaches_a_frozen_batchnorm() -> None:
     encoder = build()
     before = encoder.backbone_hash()
