@@ -22,7 +22,8 @@ def build(*, stored: int) -> Mapping[str, Callable[..., float]]:
         stored: steps collected before.
     """
     torch.set_num_threads(1)
-    config = replace(bench_config())
+    base = bench_config()
+    config = replace(base, encoder=replace(base.encoder, frozen_precision="auto"))
     learner = learner_for(config)
     seed = np.random.SeedSequence(0)
     policy = AgentPolicy(learner.encoder, learner.rl.actor, seed)
