@@ -1,6 +1,8 @@
-"""A long run with a kill every half minute: does anything grow?"""
+"""A long run with a kill every half minute: does anything grow, and does the ratio of updates to steps hold?"""
 
+import math
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,10 @@ WARM_S = 60.0
 """Growth is measured from then on: imports and first allocations are over."""
 RSS_SLOPE = 1.0
 """Largest growth of a process in MB a minute."""
+WINDOW_STEPS = 10_000
+"""Environment steps over which the ratio is measured."""
+RATIO_ERROR = 0.01
+"""Largest relative error of the ratio in any window."""
 
 
 def soak(folder: Path, minutes: float, seed: int, environment: str) -> Outcome:
@@ -30,7 +36,7 @@ def soak(folder: Path, minutes: float, seed: int, environment: str) -> Outcome:
             seen = Observation(observed=str(error), figure="none", holds=False)
     return Outcome(
         fault=f"soak, {minutes:g} min, a kill every {KILL_EVERY_S:g} s",
-        expected="learning goes on; no process grows by more than 1 MB/min; open files stay",
+        expected="learning goes on; no process grows by more than 1 MB/min; open files stay; ratio within 1 %",
         observed=seen.observed,
         figure=seen.figure,
         holds=seen.holds,
@@ -52,14 +58,17 @@ def _follow(run: LiveRun, rng: np.random.Generator, minutes: float) -> Observati
             kills, next_kill = kills + 1, next_kill + KILL_EVERY_S
         run.until(lambda m, end=elapsed: time.monotonic() - began > end + LOOK_EVERY_S, "time to look again")
     run.more_updates(20)
+    error = worst_ratio_error(run.tail.lines, run.config.schedule.updates_per_step)
     slopes = {name: _slope(rows) for name, rows in looks.items()}
     files = {name: (rows[len(rows) // 2][2], rows[-1][2]) for name, rows in looks.items()}
     grown = ", ".join(f"{name} {slope:+.2f}" for name, slope in slopes.items())
     return Observation(
         observed=f"{kills} kills, {run.value('updates') - updates:g} updates",
         figure=f"MB/min after the first minute: {grown} (at most {RSS_SLOPE:g}); open files at half and at the end: "
-        + ", ".join(f"{name} {half} -> {end}" for name, (half, end) in files.items()),
+        + ", ".join(f"{name} {half} -> {end}" for name, (half, end) in files.items())
+        + f"; updates per step in windows of {WINDOW_STEPS} steps: off by {100 * error:.2f} % at most",
         holds=all(slope <= RSS_SLOPE for slope in slopes.values())
+        and not error > RATIO_ERROR
         and all(end <= half + 8 for half, end in files.values()),
     )
 
@@ -69,3 +78,15 @@ def _slope(rows: list[tuple[float, float, int]]) -> float:
     late = [row for row in rows if row[0] >= WARM_S / 60]
     used = late if len(late) > 5 else rows
     return float(np.polyfit([row[0] for row in used], [row[1] for row in used], 1)[0])
+
+
+def worst_ratio_error(reports: Sequence[Mapping[str, float]], ratio: float) -> float:
+    """Largest relative error of updates per environment step between reports `WINDOW_STEPS` apart; NaN without any."""
+    seen = [(line["env_steps"], line["updates"]) for line in reports if line.get("updates", 0) > 0]
+    errors, first = [], 0
+    for steps, updates in seen:
+        while first + 1 < len(seen) and steps - seen[first + 1][0] >= WINDOW_STEPS:
+            first += 1
+        if steps - seen[first][0] >= WINDOW_STEPS:
+            errors.append(abs((updates - seen[first][1]) / (steps - seen[first][0]) / ratio - 1))
+    return max(errors, default=math.nan)
