@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,8 @@ import psutil
 
 from slotfilm_dist.chaos.live import LiveRun, live_config
 from slotfilm_dist.chaos.outcome import Observation, Outcome, UnexpectedError
+from slotfilm_dist.cluster.hub_client import HubClient
+from slotfilm_dist.cluster.session import namespace_of
 
 KILL_EVERY_S = 30.0
 LOOK_EVERY_S = 2.0
@@ -48,17 +50,20 @@ def _follow(run: LiveRun, rng: np.random.Generator, minutes: float) -> Observati
     ids = run.backend.process_ids()
     followed = {name: psutil.Process(ids[name]) for name in ("learner", "hub")} | {"driver": psutil.Process()}
     looks: dict[str, list[tuple[float, float, int]]] = {name: [] for name in followed}
+    hub = HubClient.find(namespace_of(run.folder / "run"))
+    counted = [_counters(hub)]
     kills, next_kill, updates = 0, KILL_EVERY_S, run.value("updates")
     roles = [name for name in ids if name not in ("learner", "hub")]
     while (elapsed := time.monotonic() - began) < 60 * minutes:
         for name, process in followed.items():
             looks[name].append((elapsed / 60, process.memory_info().rss / 2**20, process.num_fds()))
+        counted.append(_counters(hub))
         if elapsed >= next_kill:
             run.kill(str(rng.choice(roles)))
             kills, next_kill = kills + 1, next_kill + KILL_EVERY_S
         run.until(lambda m, end=elapsed: time.monotonic() - began > end + LOOK_EVERY_S, "time to look again")
     run.more_updates(20)
-    error = worst_ratio_error(run.tail.lines, run.config.schedule.updates_per_step)
+    error = worst_ratio_error(counted, run.config.schedule.updates_per_step)
     slopes = {name: _slope(rows) for name, rows in looks.items()}
     files = {name: (rows[len(rows) // 2][2], rows[-1][2]) for name, rows in looks.items()}
     grown = ", ".join(f"{name} {slope:+.2f}" for name, slope in slopes.items())
@@ -80,13 +85,24 @@ def _slope(rows: list[tuple[float, float, int]]) -> float:
     return float(np.polyfit([row[0] for row in used], [row[1] for row in used], 1)[0])
 
 
-def worst_ratio_error(reports: Sequence[Mapping[str, float]], ratio: float) -> float:
-    """Largest relative error of updates per environment step between reports `WINDOW_STEPS` apart; NaN without any."""
-    seen = [(line["env_steps"], line["updates"]) for line in reports if line.get("updates", 0) > 0]
+def _counters(hub: HubClient) -> tuple[int, int]:
+    """Environment steps admitted and updates granted, of one moment."""
+    status = hub.status()
+    return status.admitted_steps, status.updates
+
+
+def worst_ratio_error(counted: Sequence[tuple[int, int]], ratio: float) -> float:
+    """Largest relative error of updates per step over `WINDOW_STEPS` or a little more; NaN for too short a run.
+
+    Args:
+        counted: environment steps and updates, again and again.
+        ratio: what there should be.
+    """
     errors, first = [], 0
-    for steps, updates in seen:
-        while first + 1 < len(seen) and steps - seen[first + 1][0] >= WINDOW_STEPS:
+    for steps, updates in counted:
+        while first + 1 < len(counted) and steps - counted[first + 1][0] >= WINDOW_STEPS:
             first += 1
-        if steps - seen[first][0] >= WINDOW_STEPS:
-            errors.append(abs((updates - seen[first][1]) / (steps - seen[first][0]) / ratio - 1))
+        made, wanted = updates - counted[first][1], ratio * (steps - counted[first][0])
+        if steps - counted[first][0] >= WINDOW_STEPS:
+            errors.append(abs(made / wanted - 1))
     return max(errors, default=math.nan)

@@ -287,6 +287,7 @@ class Hub:
             ages = [(max(0, newest - v), now - at) for v, at in self._acting.values() if v >= 0]
             return HubStatus(
                 env_steps=limiter.env_steps - under_way,
+                admitted_steps=limiter.env_steps,
                 updates=limiter.updates,
                 updates_owed=limiter.updates_owed(),
                 ratio=limiter.ratio,

@@ -65,6 +65,8 @@ class HubStatus:
 
     env_steps: int
     """Steps stored in replay, or collected before."""
+    admitted_steps: int
+    """The same and those on their way to a shard, for which updates are granted already."""
     updates: int
     """Updates granted."""
     updates_owed: int

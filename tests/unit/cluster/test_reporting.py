@@ -29,6 +29,7 @@ def beat(**values: object) -> WorkerBeat:
 
 
 HUB = HubStatus(
+    admitted_steps=1_000,
     env_steps=1_000,
     updates=400,
     updates_owed=0,
