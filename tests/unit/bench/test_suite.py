@@ -38,6 +38,6 @@ def test_without_the_peers_environment_the_rows_say_how_to_get_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(contender, "PEERS_PYTHON", tmp_path / "nothing")
-    rows = run_subject("e2e", BenchOptions(rounds=1, quick=True))
+    rows = [row for row in run_subject("e2e", BenchOptions(rounds=1, quick=True)) if row.goal is not None]
     assert [(row.measured, row.holds, row.goal) for row in rows] == [(None, None, 200.0), (None, None, 5.0)]
     assert all("make bench-peers" in row.how for row in rows)
