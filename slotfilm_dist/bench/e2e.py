@@ -45,7 +45,8 @@ def run(options: BenchOptions) -> list[BenchResult]:
         except ContenderError as error:
             rows.append(missing(name, goal, "times", error))
             continue
-        how = f"{WHAT}ours on stored tokens, {peer} with {text}: {rounds.describe('ours', peer, 'steps/s')}"
+        own = f"ours on stored tokens, its frozen backbone in {'bfloat16' if has_bfloat16() else 'float32'}"
+        how = f"{WHAT}{own}, {peer} in float32 with {text}: {rounds.describe('ours', peer, 'steps/s')}"
         rows.append(at_least(name, rounds.ratio("ours", peer).median, goal, "times", how))
     return rows
 

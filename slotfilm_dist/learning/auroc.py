@@ -15,7 +15,7 @@ def auroc(scores: Float[np.ndarray, " samples"], labels: Bool[np.ndarray, " samp
     num_negative = len(labels) - num_positive
     if num_positive == 0 or num_negative == 0 or np.isnan(scores).any():
         return math.nan
-    # Ranks by numpy: SciPy's `rankdata` costs every worker 0.6 s of import.
+    # Ranks by numpy: SciPy's `rankdata` costs every process 0.7 s of import.
     _, places, counts = np.unique(scores, return_inverse=True, return_counts=True)
     ranks = np.cumsum(counts) - (counts - 1) / 2
     rank_sum = float(ranks[places[labels]].sum())

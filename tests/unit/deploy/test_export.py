@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -49,21 +50,21 @@ print(" ".join(sorted({name.split(".")[0] for name in sys.modules})))
 """
 
 
-def tiny(variant: str) -> RunConfig:
+def tiny(variant: str, precision: Literal["float32", "bfloat16"] = "float32") -> RunConfig:
     config = apply_variant(variant, smoke())
     return replace(
         config,
         env=replace(config.env, image_size=64),
         obs=replace(config.obs, normalize_state=True),
-        encoder=replace(config.encoder, backbone="random", frozen_precision="float32"),
+        encoder=replace(config.encoder, backbone="random", frozen_precision=precision),
         sac=replace(config.sac, hidden=(32, 32)),
         ddpg=replace(config.ddpg, hidden=(32, 32)),
     )
 
 
-def altered(variant: str) -> Learner:
+def altered(variant: str, precision: Literal["float32", "bfloat16"] = "float32") -> Learner:
     """An agent whose every weight and statistic is away from where it begins."""
-    config = tiny(variant)
+    config = tiny(variant, precision)
     learner = Learner(config, ACTION_DIM, torch.device("cpu"), fetch_weights=False)
     learner.begin_rl(None)
     generator = torch.Generator().manual_seed(1)
@@ -90,12 +91,15 @@ def own_actions(learner: Learner, observations: dict[str, np.ndarray]) -> np.nda
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory, write_agent_run: Callable[..., Path]) -> Path:
-    """A folder for each variant: its exported policy, observations, and what the agent itself does at them."""
+    """A folder for each variant: its exported policy, observations, and what the agent itself does at them.
+
+    The agent of the run acts in bfloat16; what is exported, and compared with, is the same agent in float32.
+    """
     folder = tmp_path_factory.mktemp("exported")
     for variant in READ_BY:
         run = tmp_path_factory.mktemp("runs") / "run"
-        learner = altered(variant)
-        write_agent_run(run, learner.config, learner)
+        acting, learner = altered(variant, "bfloat16"), altered(variant)
+        write_agent_run(run, acting.config, acting)
         formats = ("torch", "onnx") if variant in AS_ONNX else ("torch",)
         export_policy(run, folder / variant / "policy", formats=formats)
         rng, inputs = np.random.default_rng(7), policy_inputs(learner.config)
