@@ -23,7 +23,8 @@ def words(arguments: list[str]) -> list[str]:
     """The words of the `slotfilm train` that begins the run or goes on with it; none if it is done."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--preset", default="paper", help="paper, steady or cluster, or a smaller one to try it out")
-    parser.add_argument("--name", default="", help="of the run's directory (default: preset and seed)")
+    parser.add_argument("--name", default="", help="of the run's directory (default: preset, variant if given, seed)")
+    parser.add_argument("--variant", default="", help="another agent of `slotfilm variants`")
     parser.add_argument("--seed", default="0")
     parser.add_argument("--runs", required=True, help="absolute, and seen by every node")
     parser.add_argument("--artifacts", required=True, help="absolute, and seen by every node")
@@ -31,15 +32,25 @@ def words(arguments: list[str]) -> list[str]:
     for path in (options.runs, options.artifacts):
         if not Path(path).is_absolute():
             parser.error(f"{path} is relative: Ray deletes a job's working directory; give a path that every node sees")
-    run = Path(options.runs) / (options.name or f"{options.preset}-s{options.seed}")
-    status = run / "status.json"
-    if status.exists() and json.loads(status.read_text(encoding="utf-8")).get("phase") == "done":
+    given = [options.preset, *filter(None, [options.variant]), f"s{options.seed}"]
+    run = Path(options.runs) / (options.name or "-".join(given))
+    if _phase(run / "status.json") == "done":
         print(f"{run} is done; see {run / 'report.html'}")
         return []
     places = ["--artifacts", options.artifacts]
     if (run / "config.json").exists():
         return ["train", "--resume", str(run), *places, *rest]
-    return ["train", options.preset, "--seed", options.seed, "--runs", options.runs, "--name", run.name, *places, *rest]
+    agent = ["--variant", options.variant] if options.variant else []
+    begin = ["train", options.preset, *agent, "--seed", options.seed, "--runs", options.runs, "--name", run.name]
+    return [*begin, *places, *rest]
+
+
+def _phase(status: Path) -> str:
+    """How far the run has come; empty where that cannot be read: `train` then looks itself."""
+    try:
+        return str(json.loads(status.read_text(encoding="utf-8")).get("phase", ""))
+    except (OSError, ValueError, AttributeError):
+        return ""
 
 
 if __name__ == "__main__":

@@ -18,5 +18,6 @@ if __name__ == "__main__":
         print(__doc__)
         sys.exit(0)
     if len(sys.argv) < 2 or sys.argv[1].startswith("-"):
-        sys.exit("usage: python jobs/seeds.py VARIANT [PRESET] [--seeds N] [options of slotfilm grid]")
+        print("usage: python jobs/seeds.py VARIANT [PRESET] [--seeds N] [options of slotfilm grid]", file=sys.stderr)
+        sys.exit(2)
     sys.exit(main(["grid", *sys.argv[2:], "--only", sys.argv[1]]))

@@ -1,6 +1,7 @@
 """The command line: `slotfilm COMMAND`, also `python -m slotfilm_dist COMMAND`."""
 
 import importlib
+import os
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -25,6 +26,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 
 
+USERS_MISTAKES = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
+"""Errors of the system that a path which was given brings about."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; gives its exit code: 0 done, 1 failed, 2 the user's mistake, 128 + n stopped by signal n."""
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -43,6 +48,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             traceback.print_exc()
         print(f"slotfilm: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # whoever read the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        if debug:
+            traceback.print_exc()
+        print(f"slotfilm: {error}", file=sys.stderr)
+        return 2 if isinstance(error, USERS_MISTAKES) else 1
     except KeyboardInterrupt:
         print("slotfilm: stopped", file=sys.stderr)
         return 130

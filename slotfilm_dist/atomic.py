@@ -4,6 +4,7 @@ A reader sees the old content or the new one, never a part. A full disk leaves t
 """
 
 import contextlib
+import errno
 import hashlib
 import os
 import shutil
@@ -58,6 +59,22 @@ def write_atomic(path: Path, chunks: Iterable[bytes | memoryview]) -> FileDigest
         raise
     fsync_directory(path.parent)
     return FileDigest(num_bytes=num_bytes, sha256=digest.hexdigest())
+
+
+def append_whole(path: Path, data: bytes) -> None:
+    """Append to a file, or leave it as it was.
+
+    Raises:
+        OSError: the disk did not take it, or took only a part, which is cut off again.
+    """
+    with path.open("ab", buffering=0) as file:
+        end = file.tell()
+        try:
+            if file.write(data) != len(data):
+                raise OSError(errno.ENOSPC, "was written only in part", str(path))
+        except OSError:
+            file.truncate(end)
+            raise
 
 
 @contextlib.contextmanager

@@ -15,6 +15,10 @@ class RunFailedError(RuntimeError):
     """The run cannot go on; the message names the cause and the remedy."""
 
 
+class EvaluationFailedError(RunFailedError):
+    """Episodes could not be played, or their result not be written; training itself could go on."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TrainReport:
     """What happened since the last report."""
@@ -80,8 +84,12 @@ class Backend(Protocol):
         """Train until the schedule's end, or until `should_stop`, reporting a few times a second."""
         ...
 
-    def play(self, player: Player, seeds: Sequence[int]) -> Iterator[EpisodeSummary]:
-        """Play episodes on held-out seeds."""
+    def play(self, player: Player, seeds: Sequence[int], should_stop: Callable[[], bool]) -> Iterator[EpisodeSummary]:
+        """Play episodes on held-out seeds; fewer once `should_stop`.
+
+        Raises:
+            EvaluationFailedError: the episodes cannot be played.
+        """
         ...
 
     def record(self, player: Player, seed: int, video: Path, film_strip: Path) -> EpisodeSummary:

@@ -1,18 +1,14 @@
 """Every setting of a run, with the paper's value as default unless a docstring says otherwise.
 
-Sections are frozen dataclasses; a wrong value raises ``ValueError`` that names the field and the fix. The whole tree is
-written to ``config.json`` and read back strictly: an unknown key is an error, never ignored.
+Sections are frozen dataclasses; a wrong value raises ``ValueError`` that names the field and the fix. `config_files`
+writes the whole tree to ``config.json`` and reads it back.
 """
 
 import dataclasses
 import difflib
-import hashlib
-import json
 import math
-import typing
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 STATE_FIELD_DIMS: dict[str, int] = {
     "qpos": 9,
@@ -21,7 +17,6 @@ STATE_FIELD_DIMS: dict[str, int] = {
     "tcp_twist": 6,
     "goal": 3,
     "is_grasped": 1,
-    "target_pose": 7,
     "tcp_to_goal": 3,
     "object_poses": 7,
     "object_pose": 7,
@@ -29,10 +24,10 @@ STATE_FIELD_DIMS: dict[str, int] = {
     "object_to_goal": 3,
     "object_to_goal_near": 3,
 }
-"""Size of each field of the proprioceptive vector; ``object_poses`` counts once per object of the task."""
+"""Size of each field of the proprioceptive vector; ``object_poses`` counts once per object of the task.
 
-PRIVILEGED_FIELDS = frozenset({"object_poses", "object_pose", "tcp_to_object", "object_to_goal", "object_to_goal_near"})
-"""Fields that read the simulator's object poses: only the validation variant ``oracle_state`` uses them."""
+Those that name an object read the simulator's poses: only the validation variant ``oracle_state`` uses them.
+"""
 
 TEMPERATURE_FIELDS = ("temperature_mode", "temperature", "final_temperature", "annealing_updates")
 """Fields of `sac` that a resumed run may change."""
@@ -201,6 +196,11 @@ class RewardConfig:
     def __post_init__(self) -> None:
         _positive("reward", self, "alpha", "varpi", "delta_m", "near_cap", "eps")
 
+    @property
+    def divisor(self) -> float:
+        """What the weighted components are divided by."""
+        return self.weights.total if self.normalize == "sum" else 1.0
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SuccessConfig:
@@ -217,6 +217,7 @@ class SuccessConfig:
         _positive("success", self, "static_threshold")
 
 
+Precision = Literal["float32", "bfloat16", "auto"]
 Fusion = Literal["film_tanh", "film_clamp", "concat_proj", "concat_late", "none", "state_only"]
 
 
@@ -232,7 +233,7 @@ class EncoderConfig:
     """Initial ResNet-18 weights: torchvision's ImageNet download, a file, or random. Never falls back silently."""
     backbone_path: str = ""
     """ResNet-18 weights for `backbone = path`: .safetensors, or a torch state dict (loaded with weights_only)."""
-    frozen_precision: Literal["float32", "bfloat16", "auto"] = "float32"
+    frozen_precision: Precision = "float32"
     """Arithmetic of the frozen backbone on a CPU: bfloat16 takes two thirds of the time where the processor has it, and
     the tokens lose their third digit; `auto` takes it there and float32 elsewhere."""
     feature_dim: int = 42
@@ -321,8 +322,9 @@ class PretrainConfig:
     """Position errors in [0, 1] image units, or in pixels."""
     train_backbone: Literal["all", "none"] = "all"
     """Train the whole ResNet, as the paper does, or keep it as initialised and learn on its cached features."""
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Arithmetic of backbone and projection while they are trained; losses and weights are float32 in both."""
+    precision: Precision = "float32"
+    """Arithmetic of backbone and projection where they are trained; losses and weights are float32 in each. bfloat16
+    takes half of the time on a processor that has it; `auto` takes it there and float32 elsewhere."""
     holdout: float = 0.1
     """Share of the episodes' frames held out for the reported errors."""
     eval_every: int = 500
@@ -389,8 +391,6 @@ class SacConfig:
     """Bootstrap through time limits only, also through terminations, or through neither."""
     grad_clip: float = 0.0
     """Largest gradient norm of the critics and the encoder; 0 leaves gradients alone."""
-    train_heads: bool = False
-    """Also train the UV and visibility heads in RL (the critic's loss gives them no gradient)."""
     end_to_end: bool = False
     """Train backbone and projection through the critic's loss and keep images in replay (Section 7.4)."""
     augment_views: int = 0
@@ -469,10 +469,10 @@ class ReplayConfig:
     def __post_init__(self) -> None:
         _positive("replay", self, "capacity", "num_shards", "min_steps")
         check(
-            self.min_steps <= self.capacity,
+            self.min_steps <= self.capacity // 2,
             "replay.min_steps",
             self.min_steps,
-            f"must not exceed replay.capacity = {self.capacity}",
+            f"must not exceed half of replay.capacity = {self.capacity}: a ring of whole blocks is never quite full",
         )
 
 
@@ -485,7 +485,7 @@ class ScheduleConfig:
     random_steps: int = 100_000
     """Steps of the random policy before any learning; also the pre-training data."""
     random_episode_steps: int = 0
-    """Length of the random policy's episodes; 0 is `env.max_steps`. Short ones show more scenes in few steps."""
+    """Length of the random policy's episodes, `env.max_steps` at most and with 0. Short ones show more scenes."""
     updates_per_step: float = 1.0
     """Optimiser updates per environment step once learning has begun."""
 
@@ -493,10 +493,10 @@ class ScheduleConfig:
         _positive("schedule", self, "total_steps", "random_steps", "updates_per_step")
         _not_negative("schedule", self, "random_episode_steps")
         check(
-            self.random_steps <= self.total_steps,
+            self.random_steps < self.total_steps,
             "schedule.random_steps",
             self.random_steps,
-            f"must not exceed schedule.total_steps = {self.total_steps}",
+            f"must be less than schedule.total_steps = {self.total_steps}, or nothing is learned",
         )
 
 
@@ -519,10 +519,10 @@ class EvaluationConfig:
         _positive("evaluation", self, "episodes", "during_episodes")
         _not_negative("evaluation", self, "every_steps", "videos")
         check(
-            self.seed >= 10_000_000,
+            10_000_000 <= self.seed < 1 << 31,
             "evaluation.seed",
             self.seed,
-            "must be 10000000 or more, so that no training episode shares it",
+            "must be 10000000 or more, so that no training episode shares it, and below 2147483648",
         )
 
 
@@ -559,6 +559,9 @@ class RuntimeConfig:
     max_staleness_s: float = 120.0
     """Longest time that workers act without word from the hub that their weights are the newest, in seconds; then they
     pause until it comes (`ray` mode). A healthy run has it about once a second, however rarely weights change."""
+    max_memory_share: float = 0.9
+    """Share of a machine's memory in use from which its workers are stopped, one after the other, until there is room
+    again (`ray` mode); 1 never."""
     exact_resume: bool = False
     """Build the simulator anew for every training episode (`local` mode; half a second each): a resumed run then equals
     an uninterrupted one bit for bit. Without it PhysX's last digits depend on the episodes before."""
@@ -576,6 +579,8 @@ class RuntimeConfig:
             self.max_workers,
             f"must be 0 or at least runtime.num_workers = {self.num_workers}",
         )
+        check(self.cuda_graphs or not self.compiled, "runtime.compiled", self.compiled, "needs runtime.cuda_graphs")
+        check(0 < self.max_memory_share <= 1, "runtime.max_memory_share", self.max_memory_share, "must lie in (0, 1]")
         check(0 <= self.metrics_port < 65536, "runtime.metrics_port", self.metrics_port, "must lie in [0, 65535]")
 
 
@@ -638,13 +643,13 @@ class RunConfig:
     def __post_init__(self) -> None:
         check(0 <= self.seed < 2**31, "seed", self.seed, "must lie in [0, 2147483648)")
         check(
-            self.replay.min_steps <= self.schedule.total_steps,
+            self.replay.min_steps < self.schedule.total_steps,
             "replay.min_steps",
             self.replay.min_steps,
-            f"must not exceed schedule.total_steps = {self.schedule.total_steps}, or no update ever happens",
+            f"must be less than schedule.total_steps = {self.schedule.total_steps}, or no update ever happens",
         )
         check(
-            self.encoder.num_slots >= self.obs.num_objects or not self.encoder.uses_image or self.pretrain.steps == 0,
+            self.encoder.num_slots >= self.obs.num_objects or not self.pretrains,
             "encoder.num_slots",
             self.encoder.num_slots,
             "pre-training matches every object to a slot of its own and needs at least "
@@ -675,6 +680,16 @@ class RunConfig:
         )
 
     @property
+    def pretrains(self) -> bool:
+        """Whether the slots are pre-trained before RL."""
+        return self.encoder.uses_image and self.pretrain.steps > 0
+
+    @property
+    def random_episode_length(self) -> int:
+        """Steps of an episode of the random policy, never more than any other episode has."""
+        return min(self.schedule.random_episode_steps or self.env.max_steps, self.env.max_steps)
+
+    @property
     def n_step(self) -> int:
         """Rewards that a sampled transition adds up: 1, but for the algorithm with n-step returns."""
         return self.ddpg.num_steps if self.algorithm == "ddpg" else 1
@@ -683,104 +698,3 @@ class RunConfig:
     def stores_pictures(self) -> bool:
         """Whether replay keeps pictures, because what sees them is still learning."""
         return self.encoder.uses_image and (self.encoder.learns_from_pixels or self.sac.end_to_end)
-
-
-ConfigT = TypeVar("ConfigT")
-
-
-def to_dict(config: Any) -> dict[str, Any]:
-    """The config as plain dicts, lists and scalars, ready for JSON."""
-    return json.loads(json.dumps(dataclasses.asdict(config)))
-
-
-def from_dict(cls: type[ConfigT], values: dict[str, Any], where: str = "") -> ConfigT:
-    """Build a config section from plain values.
-
-    Raises:
-        ValueError: an unknown key (with the nearest known one), a value of the wrong type, or an impossible value.
-    """
-    known = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]  # cls is a dataclass by contract
-    hints = typing.get_type_hints(cls)
-    kwargs: dict[str, Any] = {}
-    for key, value in values.items():
-        path = f"{where}{key}"
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            raise ValueError(f"unknown field {path!r}" + (f"; did you mean {where + near[0]!r}?" if near else ""))
-        kwargs[key] = _coerce(hints[key], value, path)
-    lacking = [n for n, f in known.items() if n not in kwargs and f.default is f.default_factory is dataclasses.MISSING]
-    if lacking:
-        raise ValueError(f"field {where + lacking[0]!r} is missing")
-    return cls(**kwargs)
-
-
-def _coerce(kind: Any, value: Any, path: str) -> Any:
-    if dataclasses.is_dataclass(kind):
-        check(isinstance(value, dict), path, value, "must be a section of fields")
-        return from_dict(typing.cast(type, kind), value, path + ".")
-    origin = typing.get_origin(kind)
-    if origin is Literal:
-        choices = typing.get_args(kind)
-        check(value in choices, path, value, f"must be one of {', '.join(map(str, choices))}")
-        return value
-    if origin is tuple:
-        check(isinstance(value, list | tuple), path, value, "must be a list")
-        return tuple(_coerce(typing.get_args(kind)[0], item, path) for item in value)
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        check(abs(value) < 1 << 1023, path, "a number of hundreds of digits", "must be a number of sensible size")
-        return float(value)
-    check(
-        isinstance(value, kind) and (kind is bool or not isinstance(value, bool)),
-        path,
-        value,
-        f"must be {'an' if kind is int else 'a'} {getattr(kind, '__name__', kind)}",
-    )
-    return value
-
-
-def save_config(config: RunConfig, path: Path) -> None:
-    """Write the whole config as JSON."""
-    path.write_text(json.dumps(to_dict(config), indent=2) + "\n", encoding="utf-8")
-
-
-def load_config(path: Path) -> RunConfig:
-    """Read a config written by `save_config`; raises ``ValueError`` naming the file and the field."""
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ValueError(f"{path} does not exist; a run directory has a config.json") from None
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is not valid JSON: {error}") from None
-    if not isinstance(values, dict):
-        raise ValueError(f"{path} is no config: it must hold one JSON object of sections")
-    try:
-        return from_dict(RunConfig, values)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-
-
-def config_hash(*sections: Any) -> str:
-    """First 16 hex digits of SHA-256 over the sections; names artifacts and checks checkpoints.
-
-    Of a config section only the fields that differ from its defaults count, so that a version with a new field still
-    finds what an older one made.
-    """
-    plain = [
-        {type(s).__name__: {name: new for name, (_, new) in changed_fields(type(s)(), s).items()}}
-        if dataclasses.is_dataclass(s)
-        else s
-        for s in sections
-    ]
-    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def changed_fields(base: Any, other: Any, where: str = "") -> dict[str, tuple[Any, Any]]:
-    """Dotted names of the fields that differ, each with (base value, other value)."""
-    out: dict[str, tuple[Any, Any]] = {}
-    for f in dataclasses.fields(base):
-        a, b = getattr(base, f.name), getattr(other, f.name)
-        if dataclasses.is_dataclass(a) and not isinstance(a, type):
-            out |= changed_fields(a, b, f"{where}{f.name}.")
-        elif a != b:
-            out[where + f.name] = (a, b)
-    return out

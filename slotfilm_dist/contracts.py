@@ -40,6 +40,48 @@ class VectorEnv(Protocol):
 
 
 @runtime_checkable
+class AdjustableEnv(Protocol):
+    """A `VectorEnv` whose episodes can be shortened, or built anew each time."""
+
+    num_envs: int
+    action_dim: int
+    reward_term_names: tuple[str, ...]
+
+    @property
+    def has_camera(self) -> bool:
+        """Whether it gives pictures."""
+        ...
+
+    @property
+    def episode_steps(self) -> int:
+        """Steps after which an episode is truncated."""
+        ...
+
+    @episode_steps.setter
+    def episode_steps(self, steps: int) -> None: ...
+
+    @property
+    def fresh_episodes(self) -> bool:
+        """Whether the simulator is built anew for every episode."""
+        ...
+
+    @fresh_episodes.setter
+    def fresh_episodes(self, fresh: bool) -> None: ...
+
+    def reset(self, seeds: Sequence[int]) -> Observation:
+        """Start an episode."""
+        ...
+
+    def step(self, action: Float32[np.ndarray, "envs action"], next_seeds: Sequence[int]) -> StepResult:
+        """Execute one control step."""
+        ...
+
+    def close(self) -> None:
+        """Release the simulator."""
+        ...
+
+
+@runtime_checkable
 class ReplayStore(Protocol):
     """Where transitions wait for the learner."""
 

@@ -18,9 +18,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
+from slotfilm_dist.config import RuntimeConfig
 from slotfilm_dist.dashboards import dashboard_urls, probe_dashboard
 from slotfilm_dist.envs.vulkan_probe import VulkanProbe, probe_vulkan, software_driver
-from slotfilm_dist.machine import GIB, usable_cores, usable_memory_bytes
+from slotfilm_dist.machine import GIB, usable_cores, usable_memory_bytes, used_memory_share
 
 DISTRIBUTION = "slotfilm-dist"
 QUICK_MEMORY_GB = 6.0
@@ -86,7 +87,7 @@ def collect_checks() -> list[Check]:
             ray.result(),
             dashboards.result(),
             check_cores(usable_cores()),
-            check_memory(usable_memory_bytes() / GIB),
+            check_memory(usable_memory_bytes() / GIB, used_memory_share()),
             check_disk(Path.cwd()),
             check_shared_memory(Path("/dev/shm")),
             check_open_files(*resource.getrlimit(resource.RLIMIT_NOFILE)),
@@ -252,9 +253,12 @@ def check_cores(cores: float) -> Check:
     return Check(name="Cores", status="warn", found=found, fix=fix)
 
 
-def check_memory(usable_gb: float) -> Check:
-    """The quick preset needs 6 GB."""
-    found = f"{usable_gb:.1f} GiB"
+def check_memory(usable_gb: float, used_share: float = 0.0) -> Check:
+    """The quick preset needs 6 GB, and workers on Ray a machine that is not full."""
+    found = f"{usable_gb:.1f} GiB, {used_share:.0%} in use"
+    if used_share > RuntimeConfig().max_memory_share:
+        fix = "workers would stand still: end other programs, or see runtime.max_memory_share"
+        return Check(name="Memory", status="warn", found=found, fix=fix)
     # Machines sold with 6 GB show a little less: firmware and kernel keep a share.
     if usable_gb * GIB >= 0.95 * QUICK_MEMORY_GB * 1e9:
         return Check(name="Memory", status="ok", found=found)

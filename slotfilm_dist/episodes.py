@@ -59,3 +59,20 @@ class EpisodeTracker:
         self._success[i] = self._grasped[i] = False
         self._terms[i] = 0
         return summary
+
+
+def episode_metrics(
+    episodes: list[EpisodeSummary], term_names: tuple[str, ...], reward_scale: float
+) -> dict[str, float]:
+    """Means over some episodes, by metric name; `episode_return_scaled` is the return times the reward scale."""
+    mean_return = float(np.mean([e.episode_return for e in episodes]))
+    terms = np.mean([e.reward_terms for e in episodes], axis=0)
+    return {
+        "episode_return": mean_return,
+        "episode_return_scaled": mean_return * reward_scale,
+        "episode_length_steps": float(np.mean([e.length for e in episodes])),
+        "episode_success": float(np.mean([e.success_at_end for e in episodes])),
+        "episode_success_once": float(np.mean([e.success_once for e in episodes])),
+        "episode_placed": float(np.mean([e.placed_at_end for e in episodes])),
+        "episode_grasped": float(np.mean([e.grasped_once for e in episodes])),
+    } | {f"episode_reward_term/{name}": float(value) for name, value in zip(term_names, terms, strict=True)}

@@ -9,6 +9,7 @@ running episode, where the simulator's state follows from a seed, so that a resu
 """
 
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,13 +19,15 @@ import torch
 
 from slotfilm_dist.backend import Player, RunFailedError, TrainReport
 from slotfilm_dist.config import RunConfig
+from slotfilm_dist.contracts import AdjustableEnv
 from slotfilm_dist.evaluation.rollouts import Recorder
 from slotfilm_dist.evaluation.video import write_film_strip, write_video
-from slotfilm_dist.learning.checkpoint import CheckpointStore, read_checkpoint, write_checkpoint
+from slotfilm_dist.learning.checkpoint import CheckpointStore, read_checkpoint
 from slotfilm_dist.learning.learner import Learner, dataset_hash, learning_hash
 from slotfilm_dist.learning.off_policy import TrainingDivergedError
+from slotfilm_dist.learning.pretraining_files import continue_unfinished, save_finished, save_unfinished
 from slotfilm_dist.learning.recovery import Recovery
-from slotfilm_dist.local_envs import LocalEnv, LocalEnvs, make_wrist_env
+from slotfilm_dist.local_envs import LocalEnvs, make_wrist_env
 from slotfilm_dist.machine import usable_cores, usable_memory_bytes
 from slotfilm_dist.messages import EpisodeSummary, SampleBatch, TransitionBlock
 from slotfilm_dist.nets.agent import build_encoder
@@ -33,7 +36,7 @@ from slotfilm_dist.rejection import BrokenEnvironmentError
 from slotfilm_dist.replay.dataset import open_dataset
 from slotfilm_dist.replay.limiter import RateLimiter
 from slotfilm_dist.replay.memory import check_memory
-from slotfilm_dist.replay.shard import ReplayShard
+from slotfilm_dist.replay.shard import ReplayShard, build_shard
 from slotfilm_dist.replay.sharded import ShardedReplay
 from slotfilm_dist.replay.snapshot import MANIFEST, read_snapshot, write_snapshot
 from slotfilm_dist.rollout import RolloutLoop
@@ -49,13 +52,13 @@ REPORT_S = 1.0
 _logger = logging.getLogger(__name__)
 
 
-def learner_device(config: RunConfig) -> torch.device:
-    """Where the learner computes; raises ``ValueError`` if a GPU is asked for and there is none."""
+def learner_device(config: RunConfig, option: str = "--runtime.device") -> torch.device:
+    """Where the learner computes; raises ``ValueError``, naming the option, if a GPU is asked for and there is none."""
     wanted = config.runtime.device
     if wanted == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if wanted == "cuda" and not torch.cuda.is_available():
-        raise ValueError("runtime.device = 'cuda': torch finds no CUDA GPU here; use --runtime.device cpu or auto")
+        raise ValueError(f"runtime.device = 'cuda': torch finds no CUDA GPU here; use {option} cpu or auto")
     return torch.device(wanted)
 
 
@@ -67,7 +70,9 @@ class LocalBackend:
         make_env: builds an environment, with a camera or without.
     """
 
-    def __init__(self, config: RunConfig, make_env: Callable[[RunConfig, bool], LocalEnv] = make_wrist_env) -> None:
+    def __init__(
+        self, config: RunConfig, make_env: Callable[[RunConfig, bool], AdjustableEnv] = make_wrist_env
+    ) -> None:
         self._config = config
         self._device = learner_device(config)
         self._use_threads(all_cores=False)
@@ -99,12 +104,11 @@ class LocalBackend:
     def random_blocks(self, num_steps: int, start: int) -> Iterator[TransitionBlock]:
         """Blocks of the random policy; a collection continued at step `start` has random streams of its own."""
         seed = self._config.seed
-        steps = self._config.schedule.random_episode_steps or self._config.env.max_steps
         done = tries = 0
         while done < num_steps:
             streams = {"worker": tries, "incarnation": start}
             policy = RandomPolicy(self.action_dim, role_seed(seed, Role.RANDOM_ACTIONS, **streams))
-            self._envs.training.episode_steps = steps
+            self._envs.training.episode_steps = self._config.random_episode_length
             try:
                 loop = RolloutLoop(
                     self._envs.training, policy, role_seed(seed, Role.RANDOM_EPISODES, **streams), incarnation=start
@@ -123,16 +127,14 @@ class LocalBackend:
         self._use_threads(all_cores=True)
         learner = self._learner = Learner(self._config, self.action_dim, self._device)
         learner.begin_pretraining(open_dataset(dataset, dataset_hash(self._config)))
-        unfinished = artifact.with_name(artifact.name + ".unfinished")
-        if unfinished.exists():
-            learner.load_pretrain_state(read_checkpoint(unfinished, learner.pretrain_state().config_hash))
+        continue_unfinished(learner, artifact)
         saved_at = time.monotonic()
         while learner.pretrain_steps < self._config.pretrain.steps:
             yield learner.pretrain(PRETRAIN_CHUNK)
             if time.monotonic() - saved_at > PRETRAIN_SAVE_S:
-                write_checkpoint(unfinished, learner.pretrain_state())
+                save_unfinished(learner, artifact)
                 saved_at = time.monotonic()
-        write_checkpoint(artifact, learner.pretrain_state())
+        save_finished(learner, artifact)
         self._use_threads(all_cores=False)
 
     def begin_training(self, dataset: Path, pretrained: Path | None, resume_from: Path | None) -> dict[str, Any]:
@@ -170,18 +172,31 @@ class LocalBackend:
             config.schedule.updates_per_step,
             min_steps=max(config.replay.min_steps, config.schedule.random_steps),
             slack_updates=0,
-            slack_steps=4 * config.runtime.block_steps + config.sac.batch_size,
+            # Enough for a block while an update takes many steps, as the smallest ratios ask for.
+            slack_steps=max(
+                4 * config.runtime.block_steps + config.sac.batch_size,
+                config.runtime.block_steps + math.ceil(1 / config.schedule.updates_per_step) + 1,
+            ),
         )
         self._limiter.try_insert(data.num_steps)
         self._limiter.start_learning(data.num_steps)
         self._policy = AgentPolicy(learner.encoder, learner.rl.actor, role_seed(config.seed, Role.ACTIONS))
-        self._loop = RolloutLoop(self._envs.training, self._policy, role_seed(config.seed, Role.EPISODES))
+        self._policy.version = learner.updates
+        self._loop = self._new_loop(0)
         if values:
             self._limiter.load(values["limiter"])
             if "rollout" in values:  # a checkpoint written on a cluster has neither: its workers draw anew
                 self._loop.load(values["rollout"])
                 self._policy.load_noise(values["noise"])
+            if self._store.knows(0, self._loop.incarnation, self._loop.sequence):
+                # Replay is ahead of an older checkpoint, or has been on a cluster: these blocks are others.
+                self._loop = self._new_loop(self._store.newest_incarnation(0) + 1)
         return values
+
+    def _new_loop(self, incarnation: int) -> RolloutLoop:
+        """Rollouts with episodes of their own for every incarnation."""
+        seed = role_seed(self._config.seed, Role.EPISODES, incarnation=incarnation)
+        return RolloutLoop(self._envs.training, self._policy, seed, incarnation=incarnation)
 
     def load_agent(self, checkpoints: Path) -> int:
         """Build the agent of a run's newest checkpoint, to play with; gives the environment steps it learned from.
@@ -206,10 +221,11 @@ class LocalBackend:
         while limiter.env_steps < config.schedule.total_steps:
             left = config.schedule.total_steps - limiter.env_steps
             block = self._collect(min(config.runtime.block_steps, left))
-            self._store.insert(block)
+            is_new = self._store.insert(block)
+            assert is_new, "blocks of one process are numbered"
             limiter.try_insert(block.num_steps)
             episodes += [(episode, block.policy_version) for episode in block.episodes]
-            for _ in range(limiter.updates_owed()):
+            while limiter.updates_owed():  # also those that a return to a checkpoint has lost
                 self._update(self._store.sample(1, config.sac.batch_size)[0])
             self._policy.version = learner.updates
             now = time.monotonic()
@@ -237,12 +253,7 @@ class LocalBackend:
                 self._envs.replace_broken(error)
                 self._rejected_before += self._loop.num_rejected
                 self._cut_before += self._loop.num_cut_episodes
-                self._loop = RolloutLoop(
-                    self._envs.training,
-                    self._policy,
-                    role_seed(self._config.seed, Role.EPISODES, incarnation=self._loop.incarnation + 1),
-                    incarnation=self._loop.incarnation + 1,
-                )
+                self._loop = self._new_loop(self._loop.incarnation + 1)
 
     def _update(self, batch: SampleBatch) -> None:
         """One update that is due; what a return to a checkpoint loses is due again."""
@@ -264,10 +275,13 @@ class LocalBackend:
             "worker_restarts_total/nonfinite": self._envs.num_broken,
         }
 
-    def play(self, player: Player, seeds: Sequence[int]) -> Iterator[EpisodeSummary]:
-        """Play episodes in an environment of their own."""
+    def play(self, player: Player, seeds: Sequence[int], should_stop: Callable[[], bool]) -> Iterator[EpisodeSummary]:
+        """Play episodes in an environment of their own; a stop takes effect between two."""
         camera = player == "agent" and self._config.encoder.uses_image
-        yield from self._envs.play(player, self._agent(player), seeds, camera=camera)
+        for episode in self._envs.play(player, self._agent(player), seeds, camera=camera):
+            yield episode
+            if should_stop():
+                return
 
     def record(self, player: Player, seed: int, video: Path, film_strip: Path) -> EpisodeSummary:
         """Play one episode with the camera on and write its video and film strip."""
@@ -299,20 +313,7 @@ class LocalBackend:
 
     def _build_replay(self, learner: Learner) -> ShardedReplay:
         config, schema = self._config, learner.schema()
-        count = config.replay.num_shards
-        shards = [
-            ReplayShard(
-                schema,
-                -(-config.replay.capacity // count),
-                role_seed(config.seed, Role.REPLAY, index + 1),
-                index=index,
-                num_shards=count,
-                block_steps=config.runtime.block_steps,
-                n_step=config.n_step,
-                gamma=config.sac.gamma,
-            )
-            for index in range(count)
-        ]
+        shards = [build_shard(ReplayShard, config, schema, index) for index in range(config.replay.num_shards)]
         return ShardedReplay(shards, role_seed(config.seed, Role.REPLAY))
 
     def _agent(self, player: Player) -> AgentPolicy | None:

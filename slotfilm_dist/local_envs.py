@@ -1,17 +1,14 @@
 """The environments of a run in one process: one to train in, one to play in, each built at its first need."""
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol, runtime_checkable
 
-import numpy as np
-from jaxtyping import Float32
-
-from slotfilm_dist.backend import Player, RunFailedError
+from slotfilm_dist.backend import EvaluationFailedError, Player, RunFailedError
 from slotfilm_dist.config import RunConfig
+from slotfilm_dist.contracts import AdjustableEnv
 from slotfilm_dist.envs.expert import ExpertPolicy
 from slotfilm_dist.envs.wrist_env import WristEnv
 from slotfilm_dist.evaluation.rollouts import Watch, play_episodes
-from slotfilm_dist.messages import EpisodeSummary, Observation, StepResult
+from slotfilm_dist.messages import EpisodeSummary
 from slotfilm_dist.policy import Policy, RandomPolicy
 from slotfilm_dist.rejection import BrokenEnvironmentError
 from slotfilm_dist.seeds import Role, role_seed
@@ -20,49 +17,7 @@ MAX_BROKEN = 5
 """Environments given up in one start of a run before it stops."""
 
 
-@runtime_checkable
-class LocalEnv(Protocol):
-    """A `VectorEnv` whose episodes can be shortened, or built anew each time."""
-
-    num_envs: int
-    action_dim: int
-    reward_term_names: tuple[str, ...]
-
-    @property
-    def has_camera(self) -> bool:
-        """Whether it gives pictures."""
-        ...
-
-    @property
-    def episode_steps(self) -> int:
-        """Steps after which an episode is truncated."""
-        ...
-
-    @episode_steps.setter
-    def episode_steps(self, steps: int) -> None: ...
-
-    @property
-    def fresh_episodes(self) -> bool:
-        """Whether the simulator is built anew for every episode."""
-        ...
-
-    @fresh_episodes.setter
-    def fresh_episodes(self, fresh: bool) -> None: ...
-
-    def reset(self, seeds: Sequence[int]) -> Observation:
-        """Start an episode."""
-        ...
-
-    def step(self, action: Float32[np.ndarray, "envs action"], next_seeds: Sequence[int]) -> StepResult:
-        """Execute one control step."""
-        ...
-
-    def close(self) -> None:
-        """Release the simulator."""
-        ...
-
-
-def make_wrist_env(config: RunConfig, camera: bool) -> LocalEnv:
+def make_wrist_env(config: RunConfig, camera: bool) -> AdjustableEnv:
     """The simulator."""
     return WristEnv(config, camera=camera)
 
@@ -75,19 +30,19 @@ class LocalEnvs:
         make_env: builds an environment, with a camera or without.
     """
 
-    def __init__(self, config: RunConfig, make_env: Callable[[RunConfig, bool], LocalEnv]) -> None:
+    def __init__(self, config: RunConfig, make_env: Callable[[RunConfig, bool], AdjustableEnv]) -> None:
         self._config, self._make_env = config, make_env
-        self._training: LocalEnv | None = None
-        self._playing: LocalEnv | None = None
+        self._training: AdjustableEnv | None = None
+        self._playing: AdjustableEnv | None = None
         self.num_broken = 0
 
     @property
-    def any(self) -> LocalEnv:
+    def any(self) -> AdjustableEnv:
         """Whichever is there, to ask for its sizes."""
         return self._playing or self.training
 
     @property
-    def training(self) -> LocalEnv:
+    def training(self) -> AdjustableEnv:
         """The environment that training collects in."""
         if self._training is None:
             self._training = self._make_env(self._config, self._config.encoder.uses_image)
@@ -121,12 +76,20 @@ class LocalEnvs:
             seeds: one episode each.
             camera: give pictures.
             watch: told of every step.
+
+        Raises:
+            EvaluationFailedError: that environment is broken; the next episodes get a new one.
         """
         if self._playing is None or (camera and not self._playing.has_camera):
             if self._playing is not None:
                 self._playing.close()
             self._playing = self._make_env(self._config, camera)
-        yield from play_episodes(self._playing, self._policy(player, agent, self._playing), seeds, watch)
+        try:
+            yield from play_episodes(self._playing, self._policy(player, agent, self._playing), seeds, watch)
+        except BrokenEnvironmentError as error:
+            self._playing.close()
+            self._playing = None
+            raise EvaluationFailedError(f"{error}; `slotfilm doctor` checks what the simulator needs") from error
 
     def close(self) -> None:
         """Release the simulators."""
@@ -134,7 +97,7 @@ class LocalEnvs:
             if env is not None:
                 env.close()
 
-    def _policy(self, player: Player, agent: Policy | None, env: LocalEnv) -> Policy:
+    def _policy(self, player: Player, agent: Policy | None, env: AdjustableEnv) -> Policy:
         if player == "random":
             return RandomPolicy(env.action_dim, role_seed(self._config.seed, Role.EVALUATION))
         if player == "expert":

@@ -96,7 +96,7 @@ _WORKER = (
     _counter("worker_blocks_total", "blocks", "Blocks of steps sent to replay.", by_worker=True),
     _gauge("worker_alive_count", "workers", "Workers that are running."),
     _gauge("worker_wanted_count", "workers", "Workers that should be running."),
-    _gauge("worker_least_share", "share", "Share of the steps that the slowest worker collected, times their number."),
+    _gauge("worker_least_share", "share", "Steps of the slowest worker over the mean of all, since they are these."),
     _duration("worker_sim_s", "Time of one environment step, physics and rendering.", by_worker=True),
     _counter("worker_wait_s_total", "s", "Time the workers have waited for the limiter and replay.", by_worker=True),
     _gauge("worker_wait_share", "share", "Share of the workers' time spent waiting."),
@@ -116,6 +116,7 @@ _REPLAY = (
     _counter("replay_missing_blocks_total", "blocks", "Gaps in the workers' block numbers."),
     _gauge("replay_shards_alive_count", "shards", "Shards that answer."),
     _restarts("replay_restarts_total", "Shards replaced, by reason."),
+    _gauge("replay_snapshot_failing_count", "shards", "Shards whose last snapshot could not be written or read."),
 )
 
 _LIMITER = (
@@ -159,10 +160,10 @@ _LEARNER = (
     _gauge("learner_value_mean", "scaled return", "Mean of the value network."),
     _gauge("learner_target_mean", "scaled return", "Mean target of the critics."),
     _gauge("learner_reward_mean", "scaled reward", "Mean reward of the sampled steps, times the reward scale."),
-    _gauge("learner_critic_gradient_norm", "1", "L2 norm of the critics' gradient before clipping."),
-    _gauge("learner_value_gradient_norm", "1", "L2 norm of the value network's gradient before clipping."),
-    _gauge("learner_actor_gradient_norm", "1", "L2 norm of the actor's gradient before clipping."),
-    _gauge("learner_encoder_gradient_norm", "1", "L2 norm of the encoder's gradient before clipping."),
+    _gauge("learner_critic_gradient_norm", "1", "L2 norm of the critics' gradient, as the optimiser gets it."),
+    _gauge("learner_value_gradient_norm", "1", "L2 norm of the value network's gradient, as the optimiser gets it."),
+    _gauge("learner_actor_gradient_norm", "1", "L2 norm of the actor's gradient, as the optimiser gets it."),
+    _gauge("learner_encoder_gradient_norm", "1", "L2 norm of the encoder's gradient, as the optimiser gets it."),
     _gauge("learner_film_gain", "1", "Mean |tanh gamma| of the FiLM layer: 0 ignores the state, 1 is its limit."),
     _gauge("learner_film_shift", "1", "Mean |beta| of the FiLM layer."),
     _gauge("learner_goal_gate", "share", "Mean weight of the goal slot in the two-way gate."),

@@ -9,16 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from slotfilm_dist.artifacts import sole_maker
-from slotfilm_dist.backend import Backend, Player, RunFailedError, TrainReport
+from slotfilm_dist.backend import Backend, EvaluationFailedError, Player, RunFailedError, TrainReport
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.envs.reward import num_reward_inputs
+from slotfilm_dist.episodes import episode_metrics
 from slotfilm_dist.evaluation.page import write_page
-from slotfilm_dist.evaluation.record import Evaluation, save_evaluation, summarize
+from slotfilm_dist.evaluation.record import AGENT, Evaluation, save_evaluation, summarize
 from slotfilm_dist.learning.learner import dataset_hash, dataset_schema, pretrain_hash
 from slotfilm_dist.messages import EpisodeSummary
 from slotfilm_dist.metrics import metric_labels, phase_index
 from slotfilm_dist.progress import Phase, Progress
-from slotfilm_dist.replay.dataset import MANIFEST
+from slotfilm_dist.replay.dataset import MANIFEST, open_dataset
 from slotfilm_dist.replay.dataset_writer import FrameDatasetWriter
 from slotfilm_dist.runs import RunDirectory
 from slotfilm_dist.saving import Saver
@@ -27,7 +28,9 @@ from slotfilm_dist.stopping import Interrupted, StopFlag
 
 RECENT_EPISODES = 20
 """Episodes that the shown return is averaged over."""
-POLICY_NAMES: dict[Player, str] = {"random": "random", "expert": "scripted expert", "agent": "trained, deterministic"}
+DURING_SEEDS = 1_000_000
+"""Distance of the seeds of evaluations during training from those of the final one."""
+POLICY_NAMES: dict[Player, str] = {"random": "random", "expert": "scripted expert", "agent": AGENT}
 
 
 def open_sinks(run: RunDirectory) -> list[ClosableSink]:
@@ -66,7 +69,7 @@ class Pipeline:
         self._status = run.read_status()
         self._sink = FanOut(open_sinks(run))
         self._began = time.monotonic() - float(self._status.get("time_s", 0.0))
-        self._best = float("-inf")
+        self._best, self._trained_steps = float("-inf"), 0
         self._returns: deque[float] = deque(maxlen=RECENT_EPISODES)
         self._solved: deque[bool] = deque(maxlen=RECENT_EPISODES)
         self._num_played = 0
@@ -132,7 +135,7 @@ class Pipeline:
 
     def _pretrain(self, dataset: Path) -> Path | None:
         config = self._config
-        if not config.encoder.uses_image or config.pretrain.steps == 0:
+        if not config.pretrains:
             return None
         folder = self._artifacts / f"encoder-{pretrain_hash(config)}"
         if not folder.exists():
@@ -146,12 +149,13 @@ class Pipeline:
     def _make_encoder(self, dataset: Path, folder: Path) -> None:
         config = self._config
         total = config.pretrain.steps
+        num_steps = open_dataset(dataset, dataset_hash(config), verify=False).num_steps
         self._progress.begin("pretrain", f"{total} gradient steps: positions, visibility, attention")
         shown: dict[str, float] = {}
         for metrics in self._backend.pretrain(dataset, folder):
             shown |= metrics
             self._progress.show(shown["pretrain_steps_total"], total, _pretrain_line(shown))
-            self._write("pretrain", config.schedule.random_steps, 0, metrics)
+            self._write("pretrain", num_steps, 0, metrics)
             self._stop.check()
         error, baseline = shown.get("pretrain_position_error_px"), shown.get("pretrain_baseline_error_px")
         self._progress.end(
@@ -162,10 +166,17 @@ class Pipeline:
 
     def _train(self, dataset: Path, pretrained: Path | None) -> None:
         config = self._config
-        if self._status.get("trained"):
-            self._backend.load_agent(self._run.checkpoints)
-            return
         total = config.schedule.total_steps
+        if self._status.get("trained"):
+            trained = int(self._status.get("env_steps", total))
+            if trained >= total:
+                self._trained_steps = trained
+                self._backend.load_agent(self._run.checkpoints)
+                return
+            self._progress.say(
+                f"   train  goes on at {trained} of now {total} steps; of a run that was over, replay holds only what "
+                "had been saved on the way, or the random policy's data: expect the return to dip first"
+            )
         self._progress.begin("train", f"{config.variant}: {total} environment steps in all")
         resumed = self._run.checkpoints if any(self._run.checkpoints.glob("updates-*")) else None
         values = self._backend.begin_training(dataset, pretrained, resumed)
@@ -186,6 +197,7 @@ class Pipeline:
                     next_evaluation = report.env_steps + config.evaluation.every_steps
             if self._saver.due(report):
                 self._save(report, next_evaluation, with_replay=False)
+        self._trained_steps = report.env_steps
         done = report.env_steps >= total
         problem = self._save(
             report, next_evaluation, with_replay=config.checkpoint.save_replay and not done, trained=done
@@ -196,8 +208,13 @@ class Pipeline:
         self._stop.check()
 
     def _evaluate_now(self, report: TrainReport) -> None:
-        seeds = self._seeds(self._config.evaluation.during_episodes)
-        result = self._play(f"step-{report.env_steps}", "agent", seeds, report.env_steps)
+        # Other episodes than the final ones: which checkpoint is the best must not be chosen by those it is judged by.
+        seeds = self._seeds(self._config.evaluation.during_episodes, DURING_SEEDS)
+        try:
+            result = self._play(f"step-{report.env_steps}", "agent", seeds, report.env_steps)
+        except EvaluationFailedError as error:
+            self._progress.say(f"   train  goes on without this evaluation: {error}")
+            return
         self._write("train", report.env_steps, report.updates, self._evaluation_metrics(result))
         if result.mean_return > self._best:
             self._best = result.mean_return
@@ -210,13 +227,11 @@ class Pipeline:
         metrics, problem = self._saver.save(report, values, with_replay=with_replay)
         self._tell_save(report, metrics, problem)
         if not problem:
-            self._run.write_status(
-                phase="train",
-                env_steps=report.env_steps,
-                updates=report.updates,
-                trained=trained,
-                time_s=self._time_s(),
-            )
+            place = {"env_steps": report.env_steps, "updates": report.updates}
+            try:
+                self._run.write_status(phase="train", trained=trained, time_s=self._time_s(), **place)
+            except OSError as error:
+                return str(error) if trained else ""  # the checkpoint is there, and the next one tells its place
         return problem
 
     def _tell_save(self, report: TrainReport, metrics: Mapping[str, float], problem: str) -> None:
@@ -225,13 +240,13 @@ class Pipeline:
             self._progress.say(f"   train  a checkpoint could not be written, the one before stays: {problem}")
 
     def _evaluate(self) -> None:
-        config = self._config
+        config, trained = self._config, self._trained_steps
         seeds = self._seeds(config.evaluation.episodes)
-        self._write("evaluate", config.schedule.total_steps, None, self._run.room())
+        self._write("evaluate", trained, None, self._run.room())
         self._progress.begin("evaluate", f"{len(seeds)} episodes each: the random policy, the trained agent")
         random = self._play("random", "random", seeds, 0)
-        final = self._play("final", "agent", seeds, config.schedule.total_steps)
-        self._write("evaluate", config.schedule.total_steps, None, self._evaluation_metrics(final))
+        final = self._play("final", "agent", seeds, trained)
+        self._write("evaluate", trained, None, self._evaluation_metrics(final))
         if config.encoder.uses_image:
             for seed in seeds[: config.evaluation.videos]:
                 self._backend.record(
@@ -246,24 +261,28 @@ class Pipeline:
             f"return {final.mean_return:.1f} against {random.mean_return:.1f} at random on the same seeds; "
             f"success {final.success_rate:.0%} [{low:.0%}, {high:.0%}]"
         )
-        self._run.write_status(phase="done", trained=True, time_s=self._time_s())
+        self._run.write_status(phase="done", env_steps=trained, trained=True, time_s=self._time_s())
 
     def _play(self, name: str, player: Player, seeds: list[int], env_steps: int) -> Evaluation:
         episodes: list[EpisodeSummary] = []
         began = time.monotonic()
-        for episode in self._backend.play(player, seeds):
+        for episode in self._backend.play(player, seeds, self._stop):
             episodes.append(episode)
             self._num_played += 1
             mean = np.mean([e.episode_return for e in episodes])
             self._progress.show(len(episodes), len(seeds), {"policy": player, "return": f"{mean:.1f}"})
             self._stop.check()
+        self._stop.check()
         result = summarize(name, POLICY_NAMES[player], env_steps, tuple(episodes), self._backend.reward_term_names)
-        save_evaluation(result, self._run.path)
+        try:
+            save_evaluation(result, self._run.path)
+        except OSError as error:
+            raise EvaluationFailedError(f"{name} could not be written: {error}; make room, then --resume") from error
         self._played_s = time.monotonic() - began
         return result
 
-    def _seeds(self, count: int) -> list[int]:
-        first = self._config.evaluation.seed
+    def _seeds(self, count: int, offset: int = 0) -> list[int]:
+        first = self._config.evaluation.seed + offset
         return list(range(first, first + count))
 
     def _evaluation_metrics(self, result: Evaluation) -> dict[str, float]:
@@ -298,7 +317,7 @@ class Pipeline:
             self._returns.append(episode.episode_return)
             self._solved.append(episode.success_at_end)
         summaries = [episode for episode, _ in episodes]
-        metrics = _episode_metrics(summaries, self._backend.reward_term_names, self._config.sac.reward_scale)
+        metrics = episode_metrics(summaries, self._backend.reward_term_names, self._config.sac.reward_scale)
         self._write("train" if episodes[0][1] >= 0 else "collect", env_steps, None, metrics)
 
     def _write(self, phase: Phase, env_steps: int, updates: int | None, values: Mapping[str, float]) -> None:
@@ -315,22 +334,6 @@ class Pipeline:
 
     def _time_s(self) -> float:
         return time.monotonic() - self._began
-
-
-def _episode_metrics(
-    episodes: list[EpisodeSummary], term_names: tuple[str, ...], reward_scale: float
-) -> dict[str, float]:
-    mean_return = float(np.mean([e.episode_return for e in episodes]))
-    terms = np.mean([e.reward_terms for e in episodes], axis=0)
-    return {
-        "episode_return": mean_return,
-        "episode_return_scaled": mean_return * reward_scale,
-        "episode_length_steps": float(np.mean([e.length for e in episodes])),
-        "episode_success": float(np.mean([e.success_at_end for e in episodes])),
-        "episode_success_once": float(np.mean([e.success_once for e in episodes])),
-        "episode_placed": float(np.mean([e.placed_at_end for e in episodes])),
-        "episode_grasped": float(np.mean([e.grasped_once for e in episodes])),
-    } | {f"episode_reward_term/{name}": float(value) for name, value in zip(term_names, terms, strict=True)}
 
 
 def _pretrain_line(metrics: Mapping[str, float]) -> dict[str, str]:

@@ -23,6 +23,7 @@ def steady() -> RunConfig:
     return replace(
         base,
         obs=replace(base.obs, normalize_state=True),
+        pretrain=replace(base.pretrain, precision="auto"),
         reward=replace(base.reward, near_form="exp_only", pg_form="exp_alpha", varpi=0.7, weights=weights),
         sac=replace(
             base.sac,
@@ -38,11 +39,11 @@ def steady() -> RunConfig:
 
 
 def cluster() -> RunConfig:
-    """The paper's numbers with many workers and shards."""
+    """`steady` with many workers and shards."""
     base = steady()
     return replace(
         base,
-        replay=replace(base.replay, num_shards=4),
+        replay=replace(base.replay, num_shards=2),
         runtime=replace(base.runtime, num_workers=14, mode="ray"),
     )
 

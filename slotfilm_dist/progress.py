@@ -40,7 +40,7 @@ class Progress:
 
     def say(self, text: str) -> None:
         """A sentence that stays."""
-        self._console.print(text, soft_wrap=True)
+        self._console.print(text, soft_wrap=True, markup=False)
 
     def begin(self, phase: Phase, text: str) -> None:
         """Start of a phase."""

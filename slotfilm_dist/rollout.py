@@ -56,6 +56,11 @@ class RolloutLoop:
         return self._incarnation
 
     @property
+    def sequence(self) -> int:
+        """Number of the next block."""
+        return self._sequence
+
+    @property
     def num_rejected(self) -> int:
         """Steps left out so far."""
         return self._check.num_rejected

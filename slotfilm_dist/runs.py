@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import re
+import shlex
 import shutil
 import socket
 import sys
@@ -20,14 +21,18 @@ import psutil
 from filelock import FileLock, Timeout
 
 from slotfilm_dist import __version__
-from slotfilm_dist.atomic import write_atomic
-from slotfilm_dist.config import TEMPERATURE_FIELDS, RunConfig, changed_fields, save_config
+from slotfilm_dist.atomic import append_whole, write_atomic
+from slotfilm_dist.config import TEMPERATURE_FIELDS, RunConfig
+from slotfilm_dist.config_files import changed_fields, save_config
 from slotfilm_dist.messages import EpisodeSummary
 
 PACKAGES = ("ray", "torch", "torchvision", "mani_skill", "sapien", "gymnasium", "numpy", "msgpack", "safetensors")
 RUN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-RESUMABLE = ("schedule", "evaluation", "runtime", "checkpoint", "lr", *(f"sac.{name}" for name in TEMPERATURE_FIELDS))
+RESUMABLE = ("schedule.total_steps", "evaluation", "runtime", "checkpoint", "lr")
+RESUMABLE += tuple(f"sac.{name}" for name in TEMPERATURE_FIELDS)
 """Sections and fields that may change when a run is resumed: budgets, places, and what is annealed by hand."""
+FIXED = ("runtime.block_steps",)
+"""Fields of those sections that may not: stored replay is cut into blocks of that size."""
 
 
 def new_run_directory(root: Path, config: RunConfig, preset: str, name: str = "") -> Path:
@@ -52,11 +57,11 @@ def new_run_directory(root: Path, config: RunConfig, preset: str, name: str = ""
 def resumed_config(path: Path, config: RunConfig, changed: RunConfig) -> RunConfig:
     """The changed config of a run that goes on; raises ``ValueError`` if it touches what was already learned from."""
     changes = changed_fields(config, changed)
-    fixed = [name for name in changes if name not in RESUMABLE and name.split(".")[0] not in RESUMABLE]
+    fixed = [n for n in changes if n in FIXED or not {n, n.split(".")[0]} & {*RESUMABLE}]
     if fixed:
         raise ValueError(
             f"--resume {path}: {', '.join(fixed)} cannot change in a run that has begun; "
-            f"only {', '.join(RESUMABLE)} can. Start a new run instead"
+            f"only {', '.join(RESUMABLE)} can, without {', '.join(FIXED)}. Start a new run instead"
         )
     return changed
 
@@ -86,6 +91,7 @@ class RunDirectory:
         self.path = path
         self.config = config
         self._lock = FileLock(path / ".lock")
+        self._unlogged: list[str] = []
 
     def __enter__(self) -> "RunDirectory":
         self.path.mkdir(parents=True, exist_ok=True)
@@ -115,11 +121,12 @@ class RunDirectory:
         return self.path / "metrics.jsonl"
 
     def log_episodes(self, episodes: Iterable[EpisodeSummary], env_steps: int, policy_version: int) -> None:
-        """Append finished training episodes."""
-        with (self.path / "episodes.jsonl").open("a", encoding="utf-8") as file:
-            for episode in episodes:
-                record = dataclasses.asdict(episode) | {"env_steps": env_steps, "policy_version": policy_version}
-                file.write(json.dumps(record) + "\n")
+        """Append finished training episodes; those that the disk does not take go with the next."""
+        own = {"env_steps": env_steps, "policy_version": policy_version}
+        self._unlogged += [json.dumps(dataclasses.asdict(episode) | own) + "\n" for episode in episodes]
+        with contextlib.suppress(OSError):
+            append_whole(self.path / "episodes.jsonl", "".join(self._unlogged).encode())
+            self._unlogged = []
 
     def room(self) -> dict[str, float]:
         """Resident memory of this process and those it started (what they share counts once for each); free disk."""
@@ -173,7 +180,7 @@ def describe_machine() -> dict[str, Any]:
         "platform": platform.platform(),
         "cpu": f"{_cpu_model()}, {os.cpu_count()} cores",
         "gpu": _gpu_model(),
-        "command": " ".join(["slotfilm", *sys.argv[1:]]),
+        "command": shlex.join(["slotfilm", *sys.argv[1:]]),
         "started_at": _now(),
     }
 

@@ -11,6 +11,8 @@ MAX_FAILED = 5
 """Checkpoints in a row that may fail; after so many a run that cannot keep what it learns stops."""
 RETRY_S = 10.0
 """Pause before a checkpoint that failed is tried again."""
+PAUSES_GROW = 4.0
+"""Factor from one such pause to the next: the last try comes a quarter of an hour after the first."""
 
 
 @runtime_checkable
@@ -78,7 +80,7 @@ class Saver:
     def _count_failure(self, error: OSError) -> float:
         self.num_failed += 1
         self._failed_in_a_row += 1
-        self._retry_at = time.monotonic() + RETRY_S
+        self._retry_at = time.monotonic() + RETRY_S * PAUSES_GROW ** (self._failed_in_a_row - 1)
         if self._failed_in_a_row >= MAX_FAILED:
             raise RunFailedError(
                 f"{MAX_FAILED} checkpoints in a row could not be written to {self._folder}, last: {error}; "

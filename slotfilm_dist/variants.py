@@ -2,10 +2,11 @@
 
 import difflib
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Literal
 
-from slotfilm_dist.config import PROPRIO_FIELDS, LrConfig, RunConfig, changed_fields
+from slotfilm_dist.config import PROPRIO_FIELDS, LrConfig, RunConfig
+from slotfilm_dist.config_files import changed_fields
 
 Variant = Callable[[RunConfig], RunConfig]
 
@@ -63,10 +64,11 @@ def drq(base: RunConfig) -> RunConfig:
 def drqv2(base: RunConfig) -> RunConfig:
     """DrQ-v2 with its own deterministic algorithm, without the state, for 2000 epochs (Appendix A.5)."""
     pixels, schedule = _on_pixels(base, "drqv2", DRQ_FEATURES), base.schedule
-    total_steps = max(schedule.total_steps * 2 // 3, schedule.random_steps)
+    learning_steps = schedule.total_steps - schedule.random_steps
+    total_steps = max(schedule.total_steps * 2 // 3, schedule.random_steps + max(1, learning_steps * 7 // 11))
     return replace(
         pixels,
-        # The noise falls until step 500k of 800k, which is 4/7 of the learning, and as far in a shorter run.
+        # 800k of 1.2 M steps are 2/3 of all and 7/11 of the learning. The noise falls until step 500k, 4/7 of that.
         ddpg=replace(base.ddpg, std_steps=schedule.random_steps + (total_steps - schedule.random_steps) * 4 // 7),
         sac=replace(base.sac, batch_size=2 * base.sac.batch_size),
         schedule=replace(schedule, total_steps=total_steps, updates_per_step=schedule.updates_per_step / 2),
@@ -119,8 +121,10 @@ def varpi_10(base: RunConfig) -> RunConfig:
 
 
 def no_static(base: RunConfig) -> RunConfig:
-    """No stability term (Figure 12)."""
-    return replace(base, reward=replace(base.reward, weights=replace(base.reward.weights, static=0.0)))
+    """No stability term (Figure 12); the others count what they did, so that nothing else changes."""
+    weights, divisor = base.reward.weights, base.reward.divisor
+    kept = {f.name: getattr(weights, f.name) / divisor for f in fields(weights)} | {"static": 0.0}
+    return replace(base, reward=replace(base.reward, normalize="none", weights=replace(weights, **kept)))
 
 
 def alpha_5(base: RunConfig) -> RunConfig:

@@ -11,9 +11,10 @@ import torch
 
 from slotfilm_dist.backend import TrainReport
 from slotfilm_dist.bench.agent import bench_config, learner_for
+from slotfilm_dist.bench.fetching import fetched_batches
 from slotfilm_dist.bench.filled_shards import client_of, shards_in_process, shards_on_ray
 from slotfilm_dist.bench.results import BenchOptions, BenchResult, at_least, for_information
-from slotfilm_dist.bench.rounds import Spread, interleave
+from slotfilm_dist.bench.rounds import Rounds, Spread, interleave
 from slotfilm_dist.bench.timing import calls_per_s
 from slotfilm_dist.bench.toy_data import write_toy_data
 from slotfilm_dist.bench.transitions import ACTION_DIM
@@ -22,10 +23,13 @@ from slotfilm_dist.cluster.hub_client import HubClient
 from slotfilm_dist.cluster.learner_role import LearnerRole
 from slotfilm_dist.cluster.messages import AgentSetup, UpdateGrant
 from slotfilm_dist.cluster.session import Session
+from slotfilm_dist.cluster.worker import EnvFactory
 from slotfilm_dist.config import RunConfig
-from slotfilm_dist.envs.toy import make_toy_env
+from slotfilm_dist.envs.toy import SLOW_STEP_S, make_slow_toy_env, make_toy_env
+from slotfilm_dist.machine import usable_cores
 from slotfilm_dist.messages import WeightSnapshot
 from slotfilm_dist.policy import AgentPolicy
+from slotfilm_dist.variants import apply_variant
 
 GOAL_FED, GOAL_SCALING = 0.9, 1.8
 STORED = 20_000
@@ -70,7 +74,8 @@ def run(options: BenchOptions) -> list[BenchResult]:
         data = write_toy_data(config, Path(folder))
         return [
             _fed_learner(config, data, options),
-            _worker_scaling(config, data, Path(folder), options),
+            fetched_batches(config, options),
+            *_worker_scaling(config, data, Path(folder), options),
             *_messages(config, options),
         ]
 
@@ -108,33 +113,62 @@ def _fed_learner(config: RunConfig, data: Path, options: BenchOptions) -> BenchR
     return at_least("runtime/Ray-fed learner against in-process", ratio, GOAL_FED, "times", how + described)
 
 
-def _worker_scaling(config: RunConfig, data: Path, folder: Path, options: BenchOptions) -> BenchResult:
-    """Env steps a second of two workers over one's, with a learner that has next to nothing to do."""
-    config = replace(config, schedule=replace(config.schedule, updates_per_step=0.001))
-    run = folder / "run"
+def _worker_scaling(config: RunConfig, data: Path, folder: Path, options: BenchOptions) -> list[BenchResult]:
+    """Env steps a second of two workers over one's: where a step waits for its environment, and where it computes."""
+    how = (
+        "env steps/s on Ray with the toy environment, workers added and removed during one run, a learner that has "
+        "next to nothing to do; "
+    )
+    blind = apply_variant("state_only", config)
+    waits = _two_against_one(blind, write_toy_data(blind, folder), folder / "waiting", make_slow_toy_env, options)
+    computes = _two_against_one(config, data, folder / "computing", make_toy_env, options)
+    waiting = f"each step waits {1000 * SLOW_STEP_S:.0f} ms and computes 1 to 2, state_only; cores are not short: "
+    computing = (
+        "backbone and policy on a 128 x 128 picture in every step, one thread a worker, on the "
+        f"{usable_cores():.0f} cores of learner, hub and shard: "
+    )
+    return [
+        at_least(
+            "runtime/2 workers against 1",
+            waits.ratio("2 workers", "1 worker").median,
+            GOAL_SCALING,
+            "times",
+            how + waiting + waits.describe("2 workers", "1 worker", "steps/s"),
+        ),
+        for_information(
+            "runtime/2 workers against 1, computing",
+            computes.ratio("2 workers", "1 worker").median,
+            "times",
+            how + computing + computes.describe("2 workers", "1 worker", "steps/s"),
+        ),
+    ]
+
+
+def _two_against_one(config: RunConfig, data: Path, run: Path, make_env: EnvFactory, options: BenchOptions) -> Rounds:
+    # Small blocks: steps are counted when a block is stored.
+    config = replace(
+        config,
+        schedule=replace(config.schedule, updates_per_step=0.001),
+        runtime=replace(config.runtime, block_steps=8),
+    )
     run.mkdir()
-    backend = RayBackend(config, run, make_toy_env)
+    seconds = 1 if options.quick else 8
+    backend = RayBackend(config, run, make_env)
     try:
         backend.prepare()
         backend.begin_training(data, None, None)
         reports = backend.train(lambda: False)
         rounds = interleave(
             {
-                "2 workers": lambda: _collecting(backend, reports, 2, 1 if options.quick else 5),
-                "1 worker": lambda: _collecting(backend, reports, 1, 1 if options.quick else 5),
+                "2 workers": lambda: _collecting(backend, reports, 2, seconds),
+                "1 worker": lambda: _collecting(backend, reports, 1, seconds),
             },
             min(3, options.rounds),
         )
         reports.close()  # type: ignore[attr-defined]  # it is a generator
     finally:
         backend.close()
-    how = (
-        "env steps/s on Ray with the toy environment's pictures (128 x 128, backbone and policy in every step, one "
-        "thread a worker), workers added and removed during one run: "
-    )
-    described = rounds.describe("2 workers", "1 worker", "steps/s")
-    ratio = rounds.ratio("2 workers", "1 worker").median
-    return at_least("runtime/2 workers against 1", ratio, GOAL_SCALING, "times", how + described)
+    return rounds
 
 
 def _collecting(backend: RayBackend, reports: Iterator[TrainReport], num_workers: int, seconds: int) -> float:

@@ -17,7 +17,7 @@ def write_toy_data(config: RunConfig, folder: Path) -> Path:
     env = ToyEnv(config, camera=config.encoder.uses_image)
     policy = RandomPolicy(env.action_dim, np.random.SeedSequence(0))
     loop = RolloutLoop(env, policy, np.random.SeedSequence(1))
-    path = folder / "data"
+    path = folder / f"data-{dataset_hash(config)}"
     with FrameDatasetWriter(path, dataset_schema(config, env.action_dim), dataset_hash(config)) as writer:
         while writer.num_steps < config.schedule.random_steps:
             writer.append(loop.collect(20))

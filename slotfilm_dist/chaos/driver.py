@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from slotfilm_dist.cluster.backend import RayBackend
-from slotfilm_dist.config import RunConfig, load_config
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config_files import load_config
 from slotfilm_dist.driver import drive
 from slotfilm_dist.envs.toy import make_toy_env
 

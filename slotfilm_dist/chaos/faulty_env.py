@@ -10,8 +10,9 @@ from jaxtyping import Float32
 
 from slotfilm_dist.chaos.switches import Switches
 from slotfilm_dist.config import RunConfig
+from slotfilm_dist.contracts import AdjustableEnv
 from slotfilm_dist.envs.toy import make_toy_env
-from slotfilm_dist.local_envs import LocalEnv, make_wrist_env
+from slotfilm_dist.local_envs import make_wrist_env
 from slotfilm_dist.messages import Observation, StepResult
 
 BROKEN_STEPS = 11
@@ -19,7 +20,7 @@ BROKEN_STEPS = 11
 
 
 class FaultyEnv:
-    """Passes everything through, except what its switches say; implements `LocalEnv`.
+    """Passes everything through, except what its switches say; implements `AdjustableEnv`.
 
     Switches: `hang_step` and `hang_reset` block for so many seconds, as native code does; `slow` makes every step take
     so many times as long while it lasts; `nan_reward`, `nan_state` and `black_picture` spoil one step each.
@@ -29,7 +30,7 @@ class FaultyEnv:
         switches: what happens.
     """
 
-    def __init__(self, env: LocalEnv, switches: Switches) -> None:
+    def __init__(self, env: AdjustableEnv, switches: Switches) -> None:
         self._env, self._switches = env, switches
         self.num_envs, self.action_dim = env.num_envs, env.action_dim
         self.reward_term_names, self.has_camera = env.reward_term_names, env.has_camera
@@ -90,11 +91,11 @@ class FaultyEnv:
 
 
 def make_faulty_env(
-    config: RunConfig, camera: bool, *, folder: Path, make_env: Callable[[RunConfig, bool], LocalEnv]
+    config: RunConfig, camera: bool, *, folder: Path, make_env: Callable[[RunConfig, bool], AdjustableEnv]
 ) -> FaultyEnv:
     """A faulty environment as a backend asks for one, once folder and environment are bound."""
     return FaultyEnv(make_env(config, camera), Switches(folder))
 
 
-MAKERS: dict[str, Callable[[RunConfig, bool], LocalEnv]] = {"toy": make_toy_env, "simulator": make_wrist_env}
+MAKERS: dict[str, Callable[[RunConfig, bool], AdjustableEnv]] = {"toy": make_toy_env, "simulator": make_wrist_env}
 """What a chaos run trains in."""

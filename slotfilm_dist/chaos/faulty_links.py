@@ -54,6 +54,8 @@ class LossyHub:
 class PoisonedReplay:
     """Replay, except that every reward of a request is the amount of the switch `reward`; NaN makes the loss NaN.
 
+    The switch `first_reward` does so to a request's first batch alone: fewer in a row than make a learner go back.
+
     Args:
         replay: the real one.
         folder: of the switches.
@@ -65,10 +67,12 @@ class PoisonedReplay:
     def sample(self, num_batches: int, batch_size: int) -> list[SampleBatch]:
         """Draw batches, and spoil them if told to."""
         batches = self._replay.sample(num_batches, batch_size)
-        amount = self._switches.take("reward")
-        if amount is None:
-            return batches
-        return [dataclasses.replace(b, reward=np.full_like(b.reward, amount)) for b in batches]
+        for name, num_spoiled in (("reward", len(batches)), ("first_reward", 1)):
+            amount = self._switches.take(name)
+            if amount is not None:
+                spoiled = [dataclasses.replace(b, reward=np.full_like(b.reward, amount)) for b in batches[:num_spoiled]]
+                batches = [*spoiled, *batches[num_spoiled:]]
+        return batches
 
     def num_steps(self) -> int:
         """Steps stored in the shards that answer."""

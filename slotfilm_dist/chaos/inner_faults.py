@@ -104,8 +104,8 @@ def broken_environment(run: LiveRun, rng: np.random.Generator) -> Observation:
 def nan_gradient(run: LiveRun, rng: np.random.Generator) -> Observation:
     """Losses that are NaN, fewer in a row than end in a return to a checkpoint."""
     skipped, rolled = run.value("learner_nonfinite_total"), run.value("learner_rollbacks_total")
-    run.switches.arm("reward", math.nan)
-    run.until(lambda m: m["learner_nonfinite_total"] > skipped, "a skipped update")
+    run.switches.arm("first_reward", math.nan, count=4)
+    run.until(lambda m: m["learner_nonfinite_total"] >= skipped + 4, "four skipped updates")
     run.more_updates(50)
     skipped = run.value("learner_nonfinite_total") - skipped
     return Observation(
@@ -121,7 +121,7 @@ def diverged(run: LiveRun, rng: np.random.Generator) -> Observation:
     run.until(lambda _: any(run.checkpoints.glob("updates-*")), "a checkpoint")
     rolled, version = run.value("learner_rollbacks_total"), run.value("weights_version")
     run.switches.arm("reward", math.nan, count=4)
-    run.until(lambda m: m["learner_rollbacks_total"] == rolled + 1, "a return to a checkpoint")
+    run.until(lambda m: m["learner_rollbacks_total"] > rolled, "a return to a checkpoint")
     run.switches.disarm("reward")
     run.more_updates(50)
     run.until(lambda m: m["weights_version"] > version, "weights of a higher version")
@@ -158,10 +158,10 @@ def disk_full(run: LiveRun, rng: np.random.Generator) -> Observation:
     failed = run.value("checkpoint_failed_total")
     with _no_room(run):
         run.until(lambda m: m.get("checkpoint_failed_total", 0) > failed, "a checkpoint that fails", 120)
+        left = [path.name for path in run.checkpoints.glob("*.partial")]  # now: the next try begins in some seconds
         run.more_updates(50)
         store = CheckpointStore(run.checkpoints, run.config.checkpoint.keep)
         readable = store.read_last(learning_hash(run.config)) is not None
-        left = [path.name for path in run.checkpoints.glob("*.partial")]
     written = run.value("checkpoint_written_total")
     run.until(lambda m: m["checkpoint_written_total"] > written, "a checkpoint that succeeds", 120)
     how = "full file system, ENOSPC" if run.disk_is_small else "limit on file sizes, EFBIG"

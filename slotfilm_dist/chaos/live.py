@@ -22,6 +22,7 @@ from slotfilm_dist.cluster.backend import RayBackend
 from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
 from slotfilm_dist.cluster.worker import Limits
 from slotfilm_dist.config import RunConfig
+from slotfilm_dist.machine import usable_memory_bytes, used_memory_share
 from slotfilm_dist.pipeline import Pipeline
 from slotfilm_dist.presets import smoke
 from slotfilm_dist.progress import Progress
@@ -36,6 +37,8 @@ STEP_LIMIT_S = 10.0
 """A step of the toy environment takes less than a millisecond, but an overloaded machine may stop for seconds."""
 SNAPSHOT_S = 10.0
 """Seconds between snapshots of replay, often enough to be met by a plan of minutes."""
+MEMORY_BYTES = 6 << 30
+"""Memory that the run, and a fault that takes some, may use beyond what is in use at the start."""
 DISK_BYTES = 64 << 20
 """Size of the file system that the checkpoints are written to, where one may be mounted."""
 
@@ -43,13 +46,21 @@ DISK_BYTES = 64 << 20
 def live_config(seed: int) -> RunConfig:
     """State only, on the toy environment: a step and an update take milliseconds, and the run has no end."""
     base = apply_variant("state_only", smoke())
+    share = min(base.runtime.max_memory_share, used_memory_share() + MEMORY_BYTES / usable_memory_bytes())
     return replace(
         base,
         seed=seed,
         schedule=replace(base.schedule, total_steps=100_000_000, random_steps=200, updates_per_step=0.5),
         replay=replace(base.replay, capacity=40_000, min_steps=100, num_shards=2),
         runtime=replace(
-            base.runtime, mode="ray", num_workers=2, block_steps=16, learner_threads=1, device="cpu", metrics_port=0
+            base.runtime,
+            mode="ray",
+            num_workers=2,
+            block_steps=16,
+            learner_threads=1,
+            device="cpu",
+            metrics_port=0,
+            max_memory_share=share,
         ),
         evaluation=replace(base.evaluation, every_steps=0),
         checkpoint=replace(base.checkpoint, every_updates=200),

@@ -65,6 +65,7 @@ KINDS: dict[str, FaultKind] = (
             "broken_environment": ("16", "more than 5 % of the steps: worker replaced"),
             "nan_gradient": ("17", "updates skipped and counted; parameters stay finite"),
             "diverged": ("17", "after 10 in a row back to the last checkpoint, half the rates"),
+            "short_memory": ("20", "a worker stands still until there is room; nothing else is lost"),
             "weights_lost": ("21", "old version used; its age is right to 1 s"),
         },
     )

@@ -11,6 +11,7 @@ from slotfilm_dist.chaos.black_picture import black_picture
 from slotfilm_dist.chaos.live import LiveRun, live_config
 from slotfilm_dist.chaos.outcome import Observation, Outcome, UnexpectedError
 from slotfilm_dist.chaos.plan import KINDS, FaultPlan, PlannedFault
+from slotfilm_dist.chaos.short_memory import short_memory
 
 LIVE: dict[str, Callable[[LiveRun, np.random.Generator], Observation]] = {
     act.__name__: act
@@ -30,6 +31,7 @@ LIVE: dict[str, Callable[[LiveRun, np.random.Generator], Observation]] = {
         inner_faults.nan_gradient,
         inner_faults.diverged,
         inner_faults.weights_lost,
+        short_memory,
     )
 }
 ALONE: dict[str, Callable[[Path, np.random.Generator], Observation]] = {

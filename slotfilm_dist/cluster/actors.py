@@ -21,12 +21,18 @@ from slotfilm_dist.cluster.messages import (
     WorkerBeat,
 )
 from slotfilm_dist.config import RunConfig
+from slotfilm_dist.machine import offer_memory
 from slotfilm_dist.messages import EpisodeSummary, TransitionBlock, WeightSnapshot
 
 if TYPE_CHECKING:
     from slotfilm_dist.backend import Player
     from slotfilm_dist.cluster.worker import EnvFactory, Limits
     from slotfilm_dist.replay.schema import ReplaySchema
+
+
+OFFERED = {"worker": 1000, "inference": 600, "shard": 400, "learner": 200}
+"""When memory runs out, the system ends processes with more of this first: what a run can lose before what it cannot.
+A thousand outweighs all memory of the machine. The hub and the driver offer nothing."""
 
 
 class HubActor:
@@ -79,9 +85,11 @@ class ShardActor:
     """A `ShardRole` in a process; started again by Ray when it dies, with its last snapshot."""
 
     def __init__(self, config: RunConfig, schema: "ReplaySchema", index: int, folder: Path, *, resume: bool) -> None:
-        from slotfilm_dist.cluster.shard_role import ShardRole, build_shard
+        offer_memory(OFFERED["shard"])
+        from slotfilm_dist.cluster.shard_role import FencedShard, ShardRole
+        from slotfilm_dist.replay.shard import build_shard
 
-        self._role = ShardRole(build_shard(config, schema, index), folder)
+        self._role = ShardRole(build_shard(FencedShard, config, schema, index), folder)
         restarted = ray.get_runtime_context().was_current_actor_reconstructed
         if resume or restarted:
             self._role.restore(strict=not restarted)
@@ -157,6 +165,7 @@ class InferenceActor:
     """
 
     def __init__(self, config: RunConfig, hub: Any, labels: Mapping[str, str], *, gpu: bool) -> None:
+        offer_memory(OFFERED["inference"])
         import torch
 
         from slotfilm_dist.cluster.inference import DEADLINE_S, InferenceServer
@@ -203,6 +212,7 @@ class LearnerActor:
     """A `LearnerRole` in a process."""
 
     def __init__(self, config: RunConfig, action_dim: int, num_threads: int, *, gpu: bool, hub: Any) -> None:
+        offer_memory(OFFERED["learner"])
         import torch
 
         from slotfilm_dist.cluster.learner_role import LearnerRole
@@ -246,6 +256,7 @@ class PlayerActor:
 
 def _prepare_for_acting(config: RunConfig) -> None:
     """One core for drawing and as many torch threads as asked for; more would fight over the cores."""
+    offer_memory(OFFERED["worker"])
     os.environ["LP_NUM_THREADS"] = "0"  # the software Vulkan driver draws in the calling thread
     import torch
 

@@ -12,13 +12,13 @@ from slotfilm_dist.cluster.evaluation import EvaluationPool
 from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
 from slotfilm_dist.cluster.hub_client import HubClient
 from slotfilm_dist.cluster.inference_client import InferenceClient
-from slotfilm_dist.cluster.learner_keeper import LONG_S, STOP_S, LearnerKeeper
+from slotfilm_dist.cluster.learner_keeper import LONG_S, SILENCE_S, STOP_S, LearnerKeeper
 from slotfilm_dist.cluster.messages import AgentSetup, LearnerStatus
 from slotfilm_dist.cluster.placement import STATE_RESOURCE, Placement, plan
 from slotfilm_dist.cluster.replay_client import ReplayClient, ShardClient
 from slotfilm_dist.cluster.reporting import Reporter
 from slotfilm_dist.cluster.session import Session, namespace_of, read_cluster_file
-from slotfilm_dist.cluster.system import ShardWatch
+from slotfilm_dist.cluster.shard_watch import ShardWatch
 from slotfilm_dist.cluster.wiring import Wiring
 from slotfilm_dist.cluster.workforce import Workforce, make_wrist_env
 from slotfilm_dist.config import RunConfig
@@ -181,19 +181,25 @@ class RayBackend:
             finished = counts.finished and counts.updates_owed == 0 and status.updates >= counts.updates
         self._training = False
         workers.stop()
-        self._learning.call("stop", STOP_S, timeout_s=2 * STOP_S)
+        # Not in less time than an update may take: what comes after this is the last checkpoint.
+        self._learning.call("stop", SILENCE_S, timeout_s=SILENCE_S + STOP_S)
         self._watch.tick(wait=True)
         yield self._report(reporter, self._learning.status())
 
-    def play(self, player: Player, seeds: Sequence[int]) -> Iterator[EpisodeSummary]:
-        """Play episodes in processes of their own; training goes on meanwhile."""
+    def play(self, player: Player, seeds: Sequence[int], should_stop: Callable[[], bool]) -> Iterator[EpisodeSummary]:
+        """Play episodes in processes of their own; training goes on meanwhile. A stop takes effect at once."""
         camera = player == "agent" and self._config.encoder.uses_image
         num_workers = len(self._workers.supervisor.handles)
         # While training goes on, its workers keep most of the cores.
         size = num_workers // 2 if num_workers else self._config.runtime.num_workers
         pool = self._players(max(1, min(len(seeds), size)))
         snapshot = self._acting_weights() if player == "agent" else None
-        yield from pool.play(player, seeds, camera=camera, setup=self._setup, snapshot=snapshot)
+
+        def give_up() -> bool:
+            self._workers.check()
+            return should_stop()
+
+        yield from pool.play(player, seeds, give_up, camera=camera, setup=self._setup, snapshot=snapshot)
 
     def record(self, player: Player, seed: int, video: Path, film_strip: Path) -> EpisodeSummary:
         """Play one episode with the camera on and write its video and film strip."""
@@ -223,10 +229,12 @@ class RayBackend:
         """Stop workers, then the learner, then replay, then Ray."""
         self._close_players()
         if self._workforce is not None:
-            _attempt(self._workforce.close)
+            with contextlib.suppress(RoleLostError, RoleSilentError):
+                self._workforce.close()
             self._workforce = None
         if self._learner is not None:
-            _attempt(self._learner.close)
+            with contextlib.suppress(RoleLostError, RoleSilentError):
+                self._learner.close()
             self._learner = None
         if self._inference is not None:
             self._inference.kill()
@@ -235,7 +243,8 @@ class RayBackend:
             shard.kill()
         self._shards = []
         if self._hub is not None:
-            _attempt(self._hub.close)
+            with contextlib.suppress(RoleLostError, RoleSilentError):
+                self._hub.close()
             self._hub.kill()
             self._hub = None
         if self._session is not None:
@@ -339,11 +348,3 @@ def _wait(seconds: float, should_stop: Callable[[], bool]) -> None:
     until = time.monotonic() + seconds
     while time.monotonic() < until and not should_stop():
         time.sleep(SLICE_S)
-
-
-def _attempt(ending: Callable[[], Any]) -> None:
-    """End a role; what is gone already needs no ending."""
-    try:
-        ending()
-    except (RoleLostError, RoleSilentError):
-        return

@@ -81,6 +81,11 @@ class ActorLink:
         except ray.exceptions.ActorUnavailableError as error:
             raise RoleUnreachableError(self.name, "crash", _one_line(str(error))) from None
         except ray.exceptions.RayError as error:
+            if _could_not_begin(error):
+                cause = _last_line(str(error))
+                if cause.startswith("ValueError: "):
+                    raise ValueError(cause.removeprefix("ValueError: ")) from None
+                raise RoleLostError(self.name, "crash", cause) from None
             raise RoleLostError(self.name, _reason(error), _one_line(str(error))) from None
 
     def kill(self) -> None:
@@ -91,6 +96,15 @@ class ActorLink:
 def is_ready(request: Any, timeout_s: float = 0.0) -> bool:
     """Whether the result of `ActorLink.begin` is there."""
     return bool(ray.wait([request], timeout=timeout_s)[0])
+
+
+def _could_not_begin(error: ray.exceptions.RayError) -> bool:
+    """The role's constructor raised; Ray hands its traceback on as text alone."""
+    return isinstance(error, ray.exceptions.ActorDiedError) and "error raised in its creation task" in str(error)
+
+
+def _last_line(text: str) -> str:
+    return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "no reason given")
 
 
 def _reason(error: ray.exceptions.RayError) -> str:

@@ -1,15 +1,17 @@
 """Evaluation episodes in processes of their own."""
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from slotfilm_dist.backend import Player, RunFailedError
+from slotfilm_dist.backend import EvaluationFailedError, Player
 from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
 from slotfilm_dist.cluster.messages import AgentSetup
 from slotfilm_dist.cluster.role_clients import PlayerClient
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.messages import EpisodeSummary, WeightSnapshot
+from slotfilm_dist.rejection import BrokenEnvironmentError
 
 PREPARE_S = 180.0
 """Longest time to build an environment and a policy."""
@@ -18,6 +20,16 @@ EPISODE_S = 600.0
 SLICE_S = 0.05
 MAX_LOSSES = 3
 """Players lost in one evaluation before it is given up."""
+
+
+class _Request:
+    """What a player has been asked for."""
+
+    def __init__(self, client: PlayerClient, request: Any, limit_s: float, index: int = -1) -> None:
+        self.client, self.request, self.index = client, request, index
+        self.limit_s, self.until = limit_s, time.monotonic() + limit_s
+        """How long it may take, and until when; then the player is replaced."""
+        self.what = "its environment" if index < 0 else "an episode"
 
 
 class EvaluationPool:
@@ -33,6 +45,7 @@ class EvaluationPool:
     def __init__(self, config: RunConfig, make_env: Callable[..., Any], share_cpus: float, size: int) -> None:
         self._config, self._make_env, self._share_cpus = config, make_env, share_cpus
         self._num_launched = self._num_lost = 0
+        self._under_way: list[_Request] = []
         self._players = [self._launch() for _ in range(size)]
 
     @property
@@ -44,6 +57,7 @@ class EvaluationPool:
         self,
         player: Player,
         seeds: Sequence[int],
+        give_up: Callable[[], bool],
         *,
         camera: bool,
         setup: AgentSetup | None,
@@ -51,32 +65,51 @@ class EvaluationPool:
     ) -> Iterator[EpisodeSummary]:
         """One episode for each seed, given in the order of the seeds.
 
+        Args:
+            player: who plays.
+            seeds: of the episodes.
+            give_up: asked many times a second; the episodes end once it says so, or with what it raises.
+            camera: whether the player sees.
+            setup: of the agent.
+            snapshot: its weights.
+
         Raises:
-            RunFailedError: players were lost again and again.
+            EvaluationFailedError: players were lost, broken, or silent for too long, again and again.
         """
         self._num_lost = 0
-        ready = [(p, p.begin_prepare(player, camera, setup, snapshot), -1) for p in self._players]
+
+        def prepare(client: PlayerClient) -> _Request:
+            return _Request(client, client.begin_prepare(player, camera, setup, snapshot), PREPARE_S)
+
+        self._under_way = [prepare(client) for client in self._players]
         waiting, finished = list(range(len(seeds))), dict[int, EpisodeSummary]()
         next_given = 0
-        while next_given < len(seeds):
-            client, request, index = ready.pop(0)
-            try:
-                answer = client.answer(request, "an episode", SLICE_S)
-                if index >= 0:
-                    finished[index] = answer
-                if waiting:
-                    index = waiting.pop(0)
-                    ready.append((client, client.begin_play(seeds[index]), index))
-            except RoleSilentError:
-                ready.append((client, request, index))
-            except RoleLostError as error:
-                if index >= 0:
-                    waiting.insert(0, index)
-                client = self._replace(client, error)
-                ready.append((client, client.begin_prepare(player, camera, setup, snapshot), -1))
-            while next_given in finished:
-                yield finished.pop(next_given)
-                next_given += 1
+        try:
+            while next_given < len(seeds) and not give_up():
+                asked = self._under_way.pop(0)
+                try:
+                    answer = asked.client.answer(asked.request, asked.what, SLICE_S)
+                    if asked.index >= 0:
+                        finished[asked.index] = answer
+                    if waiting:
+                        index = waiting.pop(0)
+                        request = asked.client.begin_play(seeds[index])
+                        self._under_way.append(_Request(asked.client, request, EPISODE_S, index))
+                except (RoleLostError, RoleSilentError, BrokenEnvironmentError) as error:
+                    if isinstance(error, RoleSilentError):
+                        if time.monotonic() < asked.until:
+                            self._under_way.append(asked)
+                            continue
+                        error = RoleSilentError(error.name, asked.what, asked.limit_s)
+                    if asked.index >= 0:
+                        waiting.insert(0, asked.index)
+                    self._under_way.append(prepare(self._replace(asked.client, error)))
+                while next_given in finished:
+                    yield finished.pop(next_given)
+                    next_given += 1
+        finally:
+            if self._under_way:
+                self.close()  # whoever is at something that nobody waits for
 
     def record(
         self,
@@ -94,7 +127,7 @@ class EvaluationPool:
             try:
                 client.answer(client.begin_prepare(player, True, setup, snapshot), "its environment", PREPARE_S)
                 return client.answer(client.begin_record(seed, video, film_strip), "a video", EPISODE_S)
-            except (RoleLostError, RoleSilentError) as error:
+            except (RoleLostError, RoleSilentError, BrokenEnvironmentError) as error:
                 self._replace(client, error)
 
     def close(self) -> None:
@@ -111,7 +144,10 @@ class EvaluationPool:
         client.kill()
         self._num_lost += 1
         if self._num_lost >= MAX_LOSSES:
-            raise RunFailedError(f"evaluation gave up after {self._num_lost} lost processes, last: {error}")
+            raise EvaluationFailedError(
+                f"evaluation gave up after {self._num_lost} lost processes, last: {error}; is a core free for it? "
+                "Go on with --resume"
+            )
         fresh = self._launch()
         self._players[self._players.index(client)] = fresh
         return fresh

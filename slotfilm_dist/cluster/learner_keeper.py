@@ -52,6 +52,7 @@ class LearnerKeeper:
 
     def call(self, method: str, *arguments: Any, timeout_s: float = LONG_S, **options: Any) -> Any:
         """A method of `LearnerRole` that takes its time; the same errors, plus those of a lost process."""
+        self._await_start()
         return self._client.call(method, *arguments, timeout_s=timeout_s, **options)
 
     def begin(self, dataset: Path, pretrained: Path | None, resume_from: Path | None) -> LearnerBeginning:
@@ -84,7 +85,7 @@ class LearnerKeeper:
         try:
             status = self._client.status(SILENCE_S)
         except (RoleLostError, RoleSilentError) as error:
-            return self._replace(error)
+            return self._replace_until_it_stays(error)
         if status.error:
             raise RunFailedError(f"the learner stopped: {status.error}; go on with --resume")
         return status
@@ -96,11 +97,12 @@ class LearnerKeeper:
     def close(self) -> None:
         """Stop learning, then end the process."""
         try:
-            self.call("stop", STOP_S / 2, timeout_s=STOP_S)
+            self._client.call("stop", STOP_S / 2, timeout_s=STOP_S)
         finally:
             self._client.kill()
 
     def _launch(self) -> LearnerClient:
+        self._started = False
         threads = self._config.runtime.learner_threads or max(1, int(usable_cores()) // 2)
         return LearnerClient.launch(
             self._config,
@@ -118,6 +120,27 @@ class LearnerKeeper:
         for problem in beginning.problems:
             _logger.warning("an older checkpoint is used: %s", problem)
         return beginning
+
+    def _await_start(self) -> None:
+        """Until its process runs, which Ray starts where there is room: another run may have the GPU."""
+        while not self._started:
+            try:
+                self._client.process_id()
+                self._started = True
+            except RoleSilentError:
+                _logger.warning(
+                    "the learner's process has not started yet: it asks for %g GPUs and %g cores; `ray status` shows "
+                    "who has them. Waiting; Ctrl-C twice ends the run, and --resume goes on",
+                    self._placement.learner_gpus,
+                    self._placement.learner_cpus,
+                )
+
+    def _replace_until_it_stays(self, error: Exception) -> LearnerStatus:
+        while True:
+            try:
+                return self._replace(error)
+            except (RoleLostError, RoleSilentError) as again:
+                error = again
 
     def _replace(self, error: Exception) -> LearnerStatus:
         self.num_restarts += 1

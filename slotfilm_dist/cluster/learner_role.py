@@ -1,23 +1,22 @@
 """The learner on a cluster: pre-trains, begins and continues training, writes checkpoints. Plain, without Ray."""
 
 import dataclasses
-import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from slotfilm_dist.cluster.fair_lock import FairLock
 from slotfilm_dist.cluster.learning_loops import LearningLoops, Publisher, SampleLink, UpdateLink
 from slotfilm_dist.cluster.messages import AgentSetup, LearnerBeginning, LearnerStatus
 from slotfilm_dist.config import RunConfig
-from slotfilm_dist.learning.checkpoint import Checkpoint, CheckpointStore, read_checkpoint, write_checkpoint
+from slotfilm_dist.learning.checkpoint import Checkpoint, CheckpointStore, read_checkpoint
 from slotfilm_dist.learning.learner import Learner, dataset_hash, learning_hash
+from slotfilm_dist.learning.pretraining_files import continue_unfinished, save_finished, save_unfinished
 from slotfilm_dist.learning.recovery import Recovery
 from slotfilm_dist.messages import WeightSnapshot
 from slotfilm_dist.replay.dataset import FrameDataset, open_dataset
-
-UNFINISHED = ".unfinished"
 
 
 class LearnerRole:
@@ -38,7 +37,7 @@ class LearnerRole:
         self._publisher: Publisher | None = None
         self._recovery: Recovery | None = None
         self._loops: LearningLoops | None = None
-        self._between_updates = threading.Lock()
+        self._between_updates = FairLock()
         self._candidate: Checkpoint | None = None
         self._verified: set[Path] = set()
 
@@ -64,9 +63,7 @@ class LearnerRole:
         """Get ready to pre-train on a dataset, or to go on where an interrupted pre-training stopped."""
         learner = self._learner = Learner(self._config, self._action_dim, self._device)
         learner.begin_pretraining(self._open(dataset))
-        unfinished = artifact.with_name(artifact.name + UNFINISHED)
-        if unfinished.exists():
-            learner.load_pretrain_state(read_checkpoint(unfinished, learner.pretrain_state().config_hash))
+        continue_unfinished(learner, artifact)
 
     def pretrain(self, num_steps: int) -> tuple[dict[str, float], int]:
         """Take gradient steps; gives metrics and the steps done in all."""
@@ -77,8 +74,7 @@ class LearnerRole:
 
     def save_pretraining(self, artifact: Path, *, finished: bool) -> None:
         """Write the pre-training's result, or what there is of it beside the place of the result."""
-        path = artifact if finished else artifact.with_name(artifact.name + UNFINISHED)
-        write_checkpoint(path, self.learner.pretrain_state())
+        (save_finished if finished else save_unfinished)(self.learner, artifact)
 
     def begin(self, dataset: Path, pretrained: Path | None, resume_from: Path | None) -> LearnerBeginning:
         """Build the agent and publish its first weights.

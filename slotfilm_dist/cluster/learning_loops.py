@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from typing import Protocol, runtime_checkable
 
 from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
+from slotfilm_dist.cluster.fair_lock import FairLock
 from slotfilm_dist.cluster.hub import chunk_updates
 from slotfilm_dist.cluster.messages import AgentSetup, UpdateGrant
 from slotfilm_dist.learning.learner import Learner
@@ -27,6 +28,10 @@ RETRY_S = 0.25
 """Pause before replay is asked again."""
 REQUEST_BYTES = 32 << 20
 """Batches of one request together stay below this, unless a single one is larger."""
+GRANTS_AHEAD = 3
+"""Batches are drawn for so many grants at once: a message to a shard costs as much as several batches in it."""
+FRESH_S = 1.0
+"""Batches that were drawn longer ago are not learned from, and while grants come more rarely none are drawn ahead."""
 
 
 @runtime_checkable
@@ -100,16 +105,47 @@ class Publisher:
         return snapshot
 
 
+class BatchReserve:
+    """Batches that one fetcher has drawn ahead of the updates that they are for.
+
+    Args:
+        store: gives batches.
+        batch_size: transitions of each.
+        ahead: batches of one request.
+        clock: seconds that only grow.
+    """
+
+    def __init__(
+        self, store: SampleLink, batch_size: int, ahead: int, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._store, self._batch_size, self._ahead, self._clock = store, batch_size, ahead, clock
+        self._batches: list[SampleBatch] = []
+        self._drawn_at, self._beginning = -math.inf, 0
+
+    def take(self, num_batches: int, beginning: int) -> list[SampleBatch]:
+        """So many batches, none of them old or of an earlier beginning; raises `EmptyReplayError` without any."""
+        now = self._clock()
+        steady = now - self._drawn_at <= FRESH_S
+        if not steady or beginning != self._beginning:
+            self._batches, self._beginning = [], beginning
+        missing = num_batches - len(self._batches)
+        if missing > 0:
+            self._batches += self._store.sample(max(missing, self._ahead) if steady else missing, self._batch_size)
+            self._drawn_at = now
+        taken, self._batches = self._batches[:num_batches], self._batches[num_batches:]
+        return taken
+
+
 class LearningLoops:
     """Runs its threads from `start` to `stop`.
 
     *Fetchers*: consume grants of updates and replay; produce chunks of batches, one ready while the next are fetched:
-    one fetcher waits for shards while the other takes its batches apart. Wait for the limiter, for replay to hold
-    `replay.min_steps`, for a shard's answer, and for room. Replay that stays too small, because shards were lost with
-    what they held, is filled up by the workers before the next update.
+    one fetcher waits for shards while the other takes its batches apart. Each draws for several grants at once. Wait
+    for the limiter, for replay to hold `replay.min_steps`, for a shard's answer, and for room. Replay that stays too
+    small, because shards were lost with what they held, is filled up by the workers before the next update.
 
     *Updater*: consumes chunks; produces updates and, every `runtime.publish_every`, weights. Waits for a chunk. Updates
-    that stay non-finite take it back to the last checkpoint.
+    that stay non-finite take it back to the last checkpoint, and what was drawn before is given back.
 
     All stop within a slice of their waits; updates that were granted and not made are given back. An error stops all
     and is kept in `error`.
@@ -130,13 +166,15 @@ class LearningLoops:
         store: SampleLink,
         publisher: Publisher,
         recovery: Recovery,
-        between_updates: threading.Lock,
+        between_updates: FairLock,
     ) -> None:
         self._learner, self._hub, self._store = learner, hub, store
         self._publisher, self._recovery, self._state = publisher, recovery, between_updates
         self._config = learner.config
         self._stopping = threading.Event()
-        self._ready: queue.Queue[list[SampleBatch]] = queue.Queue(1)
+        self._ready: queue.Queue[tuple[int, list[SampleBatch]]] = queue.Queue(1)
+        self._beginning = 0
+        """Grows when the learner goes back to a checkpoint; what was drawn before is not learned from."""
         self._granted = self._made = 0
         self._counting = threading.Lock()
         self._started_over_at = -math.inf
@@ -184,23 +222,25 @@ class LearningLoops:
     def _fetch_loop(self) -> None:
         chunk = chunk_updates(self._config.schedule.updates_per_step)
         schema, size = self._learner.schema(), self._config.sac.batch_size
-        chunk = max(1, min(chunk, REQUEST_BYTES // (2 * schema.row_bytes * size)))
+        most = max(1, REQUEST_BYTES // (2 * schema.row_bytes * size))
+        chunk = min(chunk, most)
+        reserve = BatchReserve(self._store, size, min(GRANTS_AHEAD * chunk, most))
         while not self._stopping.is_set():
             grant = self._hub.admit_updates(chunk, ADMIT_S)
             self.waiting_for = grant.waiting_for and f"the limiter: {grant.waiting_for}"
             if grant.num_updates:
                 with self._counting:
                     self._granted += grant.num_updates
-                self._pass_on(self._fetch(grant.num_updates, size))
+                self._pass_on(self._beginning, self._fetch(grant.num_updates, reserve))
 
-    def _fetch(self, num_batches: int, batch_size: int) -> list[SampleBatch]:
+    def _fetch(self, num_batches: int, reserve: BatchReserve) -> list[SampleBatch]:
         """Batches, once replay holds enough; none when the loop is told to stop, or where replay stays too small."""
         wanted, began, stored = self._config.replay.min_steps, time.monotonic(), 0
         while not self._stopping.is_set():
             try:
                 stored = self._store.num_steps()
                 if stored >= wanted:
-                    return self._store.sample(num_batches, batch_size)
+                    return reserve.take(num_batches, self._beginning)
                 self.waiting_for = f"replay to hold {wanted} steps; it holds {stored}"
             except (RoleLostError, RoleSilentError, EmptyReplayError) as error:
                 self.waiting_for = str(error)
@@ -219,10 +259,10 @@ class LearningLoops:
             self._started_over_at = time.monotonic()
         self._hub.start_over(missing_steps)
 
-    def _pass_on(self, batches: list[SampleBatch]) -> None:
+    def _pass_on(self, beginning: int, batches: list[SampleBatch]) -> None:
         while batches and not self._stopping.is_set():
             try:
-                self._ready.put(batches, timeout=RETRY_S)
+                self._ready.put((beginning, batches), timeout=RETRY_S)
                 return
             except queue.Full:
                 continue
@@ -233,14 +273,18 @@ class LearningLoops:
         while not self._stopping.is_set():
             began = time.monotonic()
             try:
-                batches = self._ready.get(timeout=RETRY_S)
+                beginning, batches = self._ready.get(timeout=RETRY_S)
             except queue.Empty:
                 self.waited_s += time.monotonic() - began
+                self._settle()
                 continue
             self.batch_wait_s = time.monotonic() - began
             self.waited_s += self.batch_wait_s
-            for batch in batches:
+            for index, batch in enumerate(batches):
                 if self._stopping.is_set():
+                    break
+                if beginning != self._beginning:
+                    self._give_back(made=0, granted=len(batches) - index)
                     break
                 if self._update(batch):
                     next_publish = learner.updates + every
@@ -255,9 +299,12 @@ class LearningLoops:
             try:
                 self._learner.update(batch)
             except TrainingDivergedError as error:
-                lost = self._recovery.roll_back(error)
+                counted = self._counted
+                self._recovery.roll_back(error)
                 self._counted = self._learner.updates
-                self._give_back(made=lost, granted=1)
+                # By our own count: a GPU's updates that turned out to be skipped have left the learner's already.
+                self._give_back(made=counted - self._counted, granted=1)
+                self._beginning += 1
                 self._publisher.start_over()
                 return True
             made = self._count()
@@ -265,6 +312,14 @@ class LearningLoops:
             self._give_back(made=0, granted=1 - made)
         self.update_s = time.monotonic() - began
         return False
+
+    def _settle(self) -> None:
+        """While there is nothing to do: updates of a GPU that turn out to have been skipped are due again."""
+        with self._state:
+            self._learner.settle()
+            made = self._count()
+        if made < 0:
+            self._give_back(made=0, granted=-made)
 
     def _count(self) -> int:
         """Updates made since the last call; fewer than none where earlier ones turn out to have been skipped."""

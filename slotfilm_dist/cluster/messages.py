@@ -125,12 +125,16 @@ class WorkerBeat:
     """Steps of this incarnation that were not finite or showed nothing, and were left out."""
     num_cut_episodes: int = 0
     """Episodes of this incarnation that ended with such a step."""
+    memory_share: float = 0.0
+    """Share of its machine's memory that is in use, by whomever."""
     error: str = ""
     """Why it stopped, in one line; empty while it runs."""
     error_reason: str = ""
     """The reason by the metric catalogue's words; empty while it runs."""
     running: bool = False
     """Its loop runs."""
+    ended: bool = False
+    """The loop of this incarnation has come to its end, because the run has its steps or for an error."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -84,6 +84,18 @@ def plan(config: RunConfig, nodes: Sequence[Mapping[str, float]]) -> Placement:
     )
 
 
+def check_grown(nodes: Sequence[Mapping[str, float]]) -> None:
+    """Raise ``ValueError`` while nodes that every run needs have yet to join; roles are placed once, at the start."""
+    computing = [node for node in nodes if node.get("CPU", 0.0) > 0]
+    if not computing:
+        raise ValueError("no node of this Ray cluster has cores yet; `ray status` shows which nodes it has")
+    if all(WORKER_RESOURCE in node and STATE_RESOURCE not in node for node in computing):
+        raise ValueError(
+            f"every node of this Ray cluster offers {WORKER_RESOURCE} and none {STATE_RESOURCE}, so that replay and "
+            "learner would live on nodes that may go; `ray status` shows which nodes it has"
+        )
+
+
 def num_roles_that_fit(nodes: Sequence[Mapping[str, float]], share: float) -> int:
     """Roles that find so many cores each; a role's cores lie on one node."""
     return sum(math.floor(node.get("CPU", 0.0) / share + 1e-9) for node in nodes)

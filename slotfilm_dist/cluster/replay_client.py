@@ -20,6 +20,8 @@ from slotfilm_dist.replay.sharded import cut, join_batches, split_draws
 
 DRAW_S = 2.0
 """Longest wait for a shard's batches before the other shards are asked instead."""
+LOOK_S = 10.0
+"""Longest wait for a shard's beat where somebody waits for it."""
 INSERT_S = 5.0
 """Longest wait for a shard to store a block before it is sent again."""
 REFRESH_S = 0.5
@@ -105,7 +107,7 @@ class ShardClient:
     def look(self) -> ShardBeat | None:
         """A beat of now, None if it does not answer."""
         try:
-            self._last = self.beat(DRAW_S)
+            self._last = self.beat(LOOK_S)
         except (RoleLostError, RoleSilentError):
             self._last = None
         return self._last

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from slotfilm_dist.cluster.messages import HubStatus, InferenceStatus, LearnerStatus, ShardBeat, WorkerBeat
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.contracts import MetricSink
+from slotfilm_dist.replay.ring import SampleTotals
 
 
 class Reporter:
@@ -21,6 +22,9 @@ class Reporter:
         self._config = config
         self._clock = clock
         self._last: tuple[float, HubStatus, LearnerStatus, float] | None = None
+        self._team: frozenset[int] = frozenset()
+        self._team_began: Mapping[int, int] = {}
+        self._drawn: dict[str, SampleTotals] = {}
 
     def metrics(
         self,
@@ -70,7 +74,10 @@ class Reporter:
         return values
 
     def _of_workers(self, hub: HubStatus, workers: Sequence[WorkerBeat], waited_s: float) -> dict[str, float]:
-        by_worker = list(hub.steps_by_worker.values())
+        team = frozenset(beat.worker_id for beat in workers)
+        if team != self._team:  # somebody has left or come: only what they collect together compares
+            self._team, self._team_began = team, dict(hub.steps_by_worker)
+        by_worker = [hub.steps_by_worker.get(one, 0) - self._team_began.get(one, 0) for one in team]
         values = {
             "worker_env_steps_total": float(hub.env_steps),
             "worker_blocks_total": float(hub.num_blocks),
@@ -84,28 +91,41 @@ class Reporter:
             values["weights_apply_s"] = statistics.median(lags)
         if stepping:
             values["worker_sim_s"] = sum(stepping) / len(stepping)
-        if by_worker:
-            values["worker_least_share"] = min(by_worker) * len(by_worker) / max(1, sum(by_worker))
+        if sum(by_worker) > 0:
+            values["worker_least_share"] = min(by_worker) * len(by_worker) / sum(by_worker)
         return values
 
     def _of_replay(self, hub: HubStatus, shards: Sequence[ShardBeat]) -> dict[str, float]:
         stats = [beat.stats for beat in shards]
-        drawn = sum(s.drawn.num_steps for s in stats)
         values = {
             "replay_stored_steps": float(sum(s.num_steps for s in stats)),
             "replay_capacity_steps": float(self._config.replay.capacity),
             "replay_stored_bytes": float(sum(s.ring_bytes * s.num_steps / max(1, s.capacity_steps) for s in stats)),
             "replay_inserted_steps_total": float(sum(s.inserted_steps for s in stats)),
-            "replay_sampled_steps_total": float(drawn),
+            "replay_sampled_steps_total": float(sum(s.drawn.num_steps for s in stats)),
             "replay_duplicate_blocks_total": float(sum(s.duplicate_blocks for s in stats)),
             "replay_missing_blocks_total": float(sum(s.missing_blocks for s in stats)),
             "replay_shards_alive_count": float(len(shards)),
+            "replay_snapshot_failing_count": float(sum(bool(beat.snapshot_error) for beat in shards)),
         }
-        if drawn:
-            values["replay_sample_age_steps"] = len(shards) * sum(s.drawn.age_steps for s in stats) / drawn
-            mean_version = sum(s.drawn.policy_version for s in stats) / drawn
+        drawn = self._newly_drawn(shards)
+        if drawn.num_steps:
+            values["replay_sample_age_steps"] = len(shards) * drawn.age_steps / drawn.num_steps
+            mean_version = drawn.policy_version / drawn.num_steps
             values["replay_sample_age_updates"] = max(0.0, hub.updates - mean_version)
         return values
+
+    def _newly_drawn(self, shards: Sequence[ShardBeat]) -> SampleTotals:
+        """Sums over what was drawn since the last report; of a shard's new process only from its second on."""
+        new = SampleTotals()
+        for beat in shards:
+            now, then = beat.stats.drawn, self._drawn.get(beat.starts)
+            if then is not None:
+                new.num_steps += now.num_steps - then.num_steps
+                new.age_steps += now.age_steps - then.age_steps
+                new.policy_version += now.policy_version - then.policy_version
+            self._drawn[beat.starts] = now
+        return new
 
     def _of_limiter(self, hub: HubStatus) -> dict[str, float]:
         return {

@@ -16,7 +16,7 @@ from slotfilm_dist.cluster.replay_client import ReplayClient
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.messages import TransitionBlock, WeightSnapshot
 
-UNREACHABLE_S = 20.0
+UNREACHABLE_S = 40.0
 """Longest wait for Ray to say why a worker takes no calls: a lost node shows after some missed health checks."""
 
 
@@ -28,6 +28,7 @@ class WorkerClient:
         self._question: Any = None
         self._last: WorkerBeat | None = None
         self._heard_at = time.monotonic()
+        self._unreachable = False
 
     @classmethod
     def launch(
@@ -90,16 +91,17 @@ class WorkerClient:
             try:
                 self._last = self._link.answer(question, "how it does", ANSWER_S)
             except RoleUnreachableError:
-                if self.silent_s > UNREACHABLE_S:
+                self._unreachable = True
+                if time.monotonic() - self._heard_at > UNREACHABLE_S:
                     raise
                 return self._last
-            self._heard_at = time.monotonic()
+            self._unreachable, self._heard_at = False, time.monotonic()
         return self._last
 
     @property
     def silent_s(self) -> float:
-        """Time since it last answered."""
-        return time.monotonic() - self._heard_at
+        """Time since it last answered; 0 while Ray cannot yet say what has become of it."""
+        return 0.0 if self._unreachable else time.monotonic() - self._heard_at
 
     def begin_stop(self, timeout_s: float) -> Any:
         """Ask it to stop its loop; `stopped` waits for it."""

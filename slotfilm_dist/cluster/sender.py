@@ -1,5 +1,6 @@
 """Takes a worker's blocks to replay while the worker goes on stepping."""
 
+import contextlib
 import queue
 import threading
 import time
@@ -97,6 +98,8 @@ class BlockSender:
         self._closing.set()
         self._thread.join()
         self._parking.join()
+        with contextlib.suppress(RoleLostError, RoleSilentError):
+            self._hub.confirm(self._take_stored())
 
     def _run(self) -> None:
         try:

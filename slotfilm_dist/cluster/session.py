@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import hashlib
 import json
 import logging
 import os
@@ -11,6 +12,7 @@ import shutil
 import signal
 import socket
 import tempfile
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,19 +23,36 @@ from ray._private import ray_constants
 
 from slotfilm_dist.atomic import write_atomic
 from slotfilm_dist.backend import RunFailedError
-from slotfilm_dist.cluster.placement import place
+from slotfilm_dist.cluster.placement import check_grown, place
 from slotfilm_dist.cluster.watchdog import MARK, Watchdog
-from slotfilm_dist.machine import usable_cores, usable_memory_bytes
+from slotfilm_dist.machine import ends_all_at_once, usable_cores, usable_memory_bytes
 
 STORE_BYTES = 1 << 30
 """Object store of a private cluster: only blocks, batches and weights under way live there."""
 START_ATTEMPTS = 3
 """Ray gives its own processes half a minute to start, which a loaded machine may miss."""
 PORTS_TRIED = 32
+GROW_S = 300.0
+"""Longest wait for the nodes of a cluster that was just started."""
+LISTENER_S = 5.0
+"""Longest wait until somebody takes a connection at a cluster's address."""
 FOLDER_PREFIX, OWNER_FILE = "slotfilm-", "owner"
 """A private cluster's folder, and the file in it that names the driver's process."""
 CLUSTER_FILE = "cluster.json"
 """In the run directory: how `slotfilm scale` finds the run."""
+
+SYSTEM_CONFIG = {
+    "agent_register_timeout_ms": 100_000,
+    # Roles at the usual priority: at Ray's own 15 anything else on the machine would starve them.
+    "worker_niceness": 0,
+}
+"""Of a private cluster."""
+WITHOUT_MONITOR = {"memory_monitor_refresh_ms": 0, "worker_oom_score_adjustment": 0}
+"""At 95 % Ray would end what it can start again, replay first, and then as much as brings it below, all roles at once
+if they are small. Our workers stop before that (`MemoryGuard`), and the system ends the rest in our order, unless it
+would end all of a container."""
+
+_logger = logging.getLogger(__name__)
 
 
 class Session:
@@ -49,6 +68,9 @@ class Session:
         num_cpus: cores of a private cluster; 0 takes all that may be used.
         metrics_port: where a private cluster serves metrics to Prometheus, or at a later port while others use that
             one; 0 leaves the choice to Ray.
+
+    Raises:
+        ValueError: nobody answers at `RAY_ADDRESS`, or the nodes of that cluster do not join in `GROW_S`.
     """
 
     def __init__(self, num_cpus: int = 0, metrics_port: int = 0) -> None:
@@ -63,7 +85,9 @@ class Session:
         self._joined = True
         with _signal_handlers_kept():
             if os.environ.get("RAY_ADDRESS"):
+                _require_listener("RAY_ADDRESS", os.environ["RAY_ADDRESS"])
                 ray.init(address=os.environ["RAY_ADDRESS"], log_to_driver=False, logging_level=logging.ERROR)
+                self._await_nodes()
             else:
                 self._start_private(num_cpus or max(1, int(usable_cores())), metrics_port)
 
@@ -95,7 +119,9 @@ class Session:
         return place(self.nodes() if group is None else group.bundle_specs, resource)
 
     def available_cpus(self) -> float:
-        """Cores that nobody has asked for."""
+        """Cores that nobody has asked for; in a placement group, whose bundles are its first roles', there are none."""
+        if ray.util.get_current_placement_group() is not None:
+            return 0.0
         return float(ray.available_resources().get("CPU", 0.0))
 
     def write_cluster_file(self, run: Path, namespace: str, starts: int) -> None:
@@ -125,6 +151,22 @@ class Session:
             self._watchdog.close()
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _await_nodes(self) -> None:
+        """Give a cluster that was just started time to grow; raises ``ValueError`` if it does not."""
+        deadline, told = time.monotonic() + GROW_S, False
+        while True:
+            try:
+                check_grown(self.nodes())
+                return
+            except ValueError as error:
+                if time.monotonic() > deadline:
+                    self.close()
+                    raise
+                if not told:
+                    _logger.warning("waiting up to %g s for nodes: %s", GROW_S, error)
+                told = True
+            time.sleep(1.0)
 
     def _start_private(self, num_cpus: int, metrics_port: int) -> None:
         self.private = True
@@ -168,8 +210,7 @@ class Session:
             _temp_dir=str(self._folder / "ray"),  # Ray lets everybody write there
             _node_ip_address="127.0.0.1",
             _metrics_export_port=metrics_port or None,
-            # Roles at the usual priority: at Ray's own 15 anything else on the machine would starve them.
-            _system_config={"agent_register_timeout_ms": 100_000, "worker_niceness": 0},
+            _system_config=SYSTEM_CONFIG | ({} if ends_all_at_once() else WITHOUT_MONITOR),
         )
 
     def _set(self, name: str, value: str) -> None:
@@ -217,8 +258,9 @@ def _process_name(pid: int) -> str:
 
 
 def namespace_of(run: Path) -> str:
-    """Under what name a run's hub is found."""
-    return "slotfilm-" + re.sub(r"[^A-Za-z0-9._-]", "-", run.resolve().name)
+    """Under what name a run's hub is found; runs of the same name in other folders have others."""
+    path = run.resolve()
+    return f"slotfilm-{re.sub(r'[^A-Za-z0-9._-]', '-', path.name)}-{hashlib.sha256(os.fsencode(path)).hexdigest()[:8]}"
 
 
 def read_cluster_file(run: Path) -> dict[str, Any]:
@@ -240,6 +282,9 @@ def joined(run: Path) -> Iterator[str]:
     values = read_cluster_file(run)
     if not values:
         raise ValueError(f"{run} has no {CLUSTER_FILE}: the run does not use Ray, or has not started yet")
+    if not all(isinstance(values.get(name), str) for name in ("address", "namespace", "token_path")):
+        raise ValueError(f"{run / CLUSTER_FILE} is damaged; `slotfilm train --resume {run}` writes it anew")
+    _require_listener(str(run), values["address"])
     if values["token_path"]:
         os.environ["RAY_AUTH_TOKEN_PATH"] = values["token_path"]
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
@@ -256,6 +301,21 @@ def joined(run: Path) -> Iterator[str]:
         yield values["namespace"]
     finally:
         ray.shutdown()
+
+
+def _require_listener(who: str, address: str) -> None:
+    """Ray itself tries for many minutes to reach a cluster that is gone; an address with a scheme is left to it."""
+    host, _, port = address.rpartition(":")
+    if not port.isdecimal() or "/" in host:
+        return
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), LISTENER_S):
+            return
+    except (OSError, OverflowError) as error:
+        raise ValueError(
+            f"{who}: nobody answers at {address}, where the cluster should be ({error}); it has ended, or cannot be "
+            "reached from here"
+        ) from None
 
 
 @contextlib.contextmanager

@@ -8,12 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from slotfilm_dist.cluster.messages import BlockKey, ShardBeat
-from slotfilm_dist.config import RunConfig
 from slotfilm_dist.messages import SampleBatch, TransitionBlock
-from slotfilm_dist.replay.schema import ReplaySchema
 from slotfilm_dist.replay.shard import ReplayShard
 from slotfilm_dist.replay.snapshot import MANIFEST, read_snapshot, write_snapshot
-from slotfilm_dist.seeds import Role, role_seed
 
 
 class FencedShard(ReplayShard):
@@ -30,22 +27,7 @@ class FencedShard(ReplayShard):
     def fence(self, worker_id: int, incarnation: int, asked: Iterable[BlockKey]) -> list[BlockKey]:
         """Refuse what comes late from a lost worker; gives those of the blocks asked for that are stored."""
         self._gone[worker_id] = max(incarnation, self._gone.get(worker_id, -1))
-        return [k for k in asked if self._ledger.has(k.worker_id, k.incarnation, k.sequence)]
-
-
-def build_shard(config: RunConfig, schema: ReplaySchema, index: int) -> FencedShard:
-    """Shard `index` of a run, empty."""
-    count = config.replay.num_shards
-    return FencedShard(
-        schema,
-        -(-config.replay.capacity // count),
-        role_seed(config.seed, Role.REPLAY, index + 1),
-        index=index,
-        num_shards=count,
-        block_steps=config.runtime.block_steps,
-        n_step=config.n_step,
-        gamma=config.sac.gamma,
-    )
+        return [k for k in asked if self.knows(k.worker_id, k.incarnation, k.sequence)]
 
 
 class ShardRole:
@@ -72,10 +54,11 @@ class ShardRole:
         """Take over the last snapshot; gives the steps that it held, 0 if there is none.
 
         Args:
-            strict: refuse a damaged snapshot; else begin empty and say so in `beat`.
+            strict: refuse a snapshot that cannot be read; else begin empty and say so in `beat`.
 
         Raises:
             ValueError: it is damaged or of another shape.
+            OSError: the disk does not give it.
         """
         if not (self._folder / MANIFEST).exists():
             return 0
@@ -83,7 +66,7 @@ class ShardRole:
             state = read_snapshot(self._folder)
             with self._lock:
                 self._shard.load(state)
-        except ValueError as error:
+        except (ValueError, OSError) as error:
             self._snapshot_error = str(error)
             if strict:
                 raise

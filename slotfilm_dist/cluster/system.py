@@ -26,6 +26,7 @@ progress within the limit that its own beat names, or whose process is gone, is 
 new seeds. What it had been granted and not stored is taken back from the count of steps.
 """
 
+import logging
 import threading
 import time
 from collections import Counter
@@ -35,7 +36,9 @@ from typing import Protocol, runtime_checkable
 
 from slotfilm_dist.backend import RunFailedError
 from slotfilm_dist.cluster.failures import RoleLostError
-from slotfilm_dist.cluster.messages import ShardBeat, WorkerBeat
+from slotfilm_dist.cluster.memory_guard import MemoryGuard
+from slotfilm_dist.cluster.messages import WorkerBeat
+from slotfilm_dist.machine import used_memory_share
 
 MAX_FAILURES = 5
 """Failures of one worker in a row, without a block in between, before the run is given up."""
@@ -45,6 +48,8 @@ START_LIMIT_S = 120.0
 """Longest time until a new process answers; building its simulator has a limit of its own."""
 STOP_S = 5.0
 """Time that a worker gets to finish its step and its block under way before it is killed."""
+
+_logger = logging.getLogger(__name__)
 
 
 @runtime_checkable
@@ -84,6 +89,8 @@ class _Member:
     employed_at: float
     failures: list[float] = field(default_factory=list)
     beat: WorkerBeat | None = None
+    concluded: bool = False
+    """What it was granted has been settled after it had come to its end."""
 
 
 class Supervisor:
@@ -92,19 +99,24 @@ class Supervisor:
     Args:
         launch: starts the process of a worker.
         employ: sets a worker to work with an incarnation.
-        settle: takes back what a lost worker (id, incarnation) was granted and did not store.
+        settle: takes back what a worker that is gone (id, incarnation) was granted and did not store; gives the steps.
         first_incarnation: of this start of the run; higher than any before.
+        max_memory_share: of a machine's memory in use, from which its workers are stopped.
         clock: seconds that only grow.
+        memory_share: of this machine in use, for a worker that has never said how full its own is.
     """
 
     def __init__(
         self,
         launch: Callable[[int], WorkerHandle],
         employ: Callable[[WorkerHandle, int], None],
-        settle: Callable[[int, int], None],
+        settle: Callable[[int, int], int],
         first_incarnation: int = 0,
+        max_memory_share: float = 1.0,
         clock: Callable[[], float] = time.monotonic,
+        memory_share: Callable[[], float] = used_memory_share,
     ) -> None:
+        self._guard, self._memory_share = MemoryGuard(max_memory_share, clock), memory_share
         self._launch, self._employ, self._settle, self._clock = launch, employ, settle, clock
         self._next_incarnation = first_incarnation
         self._members: dict[int, _Member] = {}
@@ -112,7 +124,8 @@ class Supervisor:
         self._stopped = False
         self.restarts: Counter[str] = Counter()
         self._rejected_before = self._cut_before = 0
-        self.last_restart = ""
+        self.num_held = 0
+        """Workers that should run and stand still."""
 
     @property
     def num_alive(self) -> int:
@@ -143,14 +156,21 @@ class Supervisor:
             return [member.beat for member in self._members.values() if member.beat is not None]
 
     def scale(self, num_workers: int) -> None:
-        """Start or stop workers until so many should run; none any more after `stop`."""
+        """Start or stop workers until so many should run; none any more after `stop`.
+
+        One whose machine is short of memory stands still for a while, unless it is the only one.
+        """
         with self._lock:
             if self._stopped:
                 return
+            shares = self._memory_shares()
             for worker_id in range(num_workers):
-                if worker_id not in self._members:
+                if worker_id not in self._members and self._guard.may_run(worker_id, shares):
                     self._start(worker_id, [])
             self._dismiss([worker_id for worker_id in self._members if worker_id >= num_workers])
+            if num_workers and not self._members:
+                self._start(0, [])
+            self.num_held = num_workers - len(self._members)
 
     def employ_again(self) -> None:
         """Stop all loops and set the workers to work anew, as `employ` now means it; their environments stay."""
@@ -165,7 +185,8 @@ class Supervisor:
                     self._replace(member, "hang", "its loop did not end")
 
     def tick(self) -> None:
-        """Look at every worker once; replace those that are lost, hung or failed.
+        """Look at every worker once; replace those that are lost, hung or failed, settle those that are done, stop
+        one whose machine is short of memory.
 
         Raises:
             RunFailedError: a worker failed too often.
@@ -175,6 +196,9 @@ class Supervisor:
                 fault = self._fault(member)
                 if fault is not None:
                     self._replace(member, *fault)
+                elif member.beat is not None and member.beat.ended and not member.concluded:
+                    self._conclude(member)
+            self._save_memory()
 
     def stop(self) -> None:
         """Stop all workers for good; those that do not end in time are killed."""
@@ -193,10 +217,10 @@ class Supervisor:
             late = self._clock() - member.employed_at > START_LIMIT_S
             return ("hang", f"no answer within {START_LIMIT_S:g} s of its start") if late else None
         member.beat = beat
-        if beat.error:
-            return beat.error_reason or "crash", beat.error
         if beat.num_blocks:
             member.failures.clear()
+        if beat.error:
+            return beat.error_reason or "crash", beat.error
         if handle.silent_s > beat.limit_s:
             return "hang", f"no answer for {handle.silent_s:.0f} s while {beat.activity}"
         if beat.running and beat.idle_s > beat.limit_s:
@@ -205,11 +229,16 @@ class Supervisor:
 
     def _replace(self, member: _Member, reason: str, cause: str) -> None:
         worker_id, now = member.handle.worker_id, self._clock()
+        share = member.beat.memory_share if member.beat is not None else self._memory_share()
         member.handle.kill()
         self._settle(worker_id, member.incarnation)
         self._retire(member)
+        if reason in ("crash", "memory") and self._guard.is_short(share):  # the system ended it, most likely
+            del self._members[worker_id]
+            self._hold(worker_id, share)
+            return
         self.restarts[reason] += 1
-        self.last_restart = f"worker {worker_id} ({reason}): {cause}"
+        _logger.warning("worker %d is replaced (%s): %s", worker_id, reason, cause)
         failures = [at for at in member.failures if now - at <= FAILURE_WINDOW_S] + [now]
         if len(failures) >= MAX_FAILURES:
             raise RunFailedError(
@@ -217,6 +246,31 @@ class Supervisor:
                 f"a block, last: {cause}; `slotfilm doctor` checks what a worker needs, then go on with --resume"
             )
         self._start(worker_id, failures)
+
+    def _memory_shares(self) -> dict[int, float]:
+        """How full each worker's machine is, by worker."""
+        return {beat.worker_id: beat.memory_share for beat in self.beats()}
+
+    def _save_memory(self) -> None:
+        shares = self._memory_shares()
+        worker_id = self._guard.pick(shares)
+        if worker_id is not None:
+            self._hold(worker_id, shares[worker_id])
+            self._dismiss([worker_id])
+            self._guard.look_again()
+
+    def _hold(self, worker_id: int, memory_share: float) -> None:
+        self.restarts["memory"] += 1
+        _logger.warning(
+            "worker %d stands still for %g s: %.0f %% of its machine's memory are in use (runtime.max_memory_share)",
+            *(worker_id, self._guard.hold(worker_id), 100 * memory_share),
+        )
+
+    def _conclude(self, member: _Member) -> None:
+        """A worker saw the run's last steps granted and ended; blocks that it could not store are still to come."""
+        member.concluded = True
+        if self._settle(member.handle.worker_id, member.incarnation):
+            self._set_to_work(member)
 
     def _start(self, worker_id: int, failures: Sequence[float]) -> None:
         handle = self._launch(worker_id)
@@ -227,6 +281,7 @@ class Supervisor:
     def _set_to_work(self, member: _Member) -> None:
         self._retire(member)
         member.incarnation, member.employed_at, member.beat = self._next_incarnation, self._clock(), None
+        member.concluded = False
         self._next_incarnation += 1
         self._employ(member.handle, member.incarnation)
 
@@ -236,8 +291,11 @@ class Supervisor:
         for member, request in zip(leaving, requests, strict=True):
             member.handle.stopped(request, STOP_S)
             member.handle.kill()
-            self._settle(member.handle.worker_id, member.incarnation)
+            lost = self._settle(member.handle.worker_id, member.incarnation)
             self._retire(member)
+            done = [other for other in self._members.values() if other.concluded]
+            if lost and done and not self._stopped:  # nobody else would collect these steps
+                self._set_to_work(done[0])
 
     def _retire(self, member: _Member) -> None:
         """Add what an incarnation counted to what those before it had."""
@@ -245,43 +303,3 @@ class Supervisor:
             self._rejected_before += member.beat.num_rejected
             self._cut_before += member.beat.num_cut_episodes
             member.beat = None
-
-
-@runtime_checkable
-class ShardHandle(Protocol):
-    """A shard as its watch needs it."""
-
-    index: int
-
-    def poll(self) -> ShardBeat | None:
-        """Its last beat; never waits; None while it does not answer."""
-        ...
-
-    def look(self) -> ShardBeat | None:
-        """A beat of now; waits for it; None if it does not answer."""
-        ...
-
-
-class ShardWatch:
-    """Counts the shards' restarts.
-
-    Args:
-        shards: Ray replaces their processes by itself.
-    """
-
-    def __init__(self, shards: Sequence[ShardHandle]) -> None:
-        self._shards = shards
-        self._starts: dict[int, str] = {}
-        self.beats: dict[int, ShardBeat] = {}
-        self.num_restarts = 0
-
-    def tick(self, *, wait: bool = False) -> None:
-        """Look at every shard once; with `wait` at what it is now, otherwise at what it last said."""
-        for shard in self._shards:
-            beat = shard.look() if wait else shard.poll()
-            if beat is None:
-                self.beats.pop(shard.index, None)
-                continue
-            self.num_restarts += self._starts.get(shard.index, beat.starts) != beat.starts
-            self._starts[shard.index] = beat.starts
-            self.beats[shard.index] = beat

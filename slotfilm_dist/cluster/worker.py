@@ -16,14 +16,15 @@ from slotfilm_dist.cluster.messages import AgentSetup, WorkerBeat
 from slotfilm_dist.cluster.outlet import Mailbox, Outlet
 from slotfilm_dist.cluster.sender import BlockSender, HubLink, StoreLink
 from slotfilm_dist.config import RunConfig
-from slotfilm_dist.contracts import VectorEnv
+from slotfilm_dist.contracts import AdjustableEnv, VectorEnv
+from slotfilm_dist.machine import used_memory_share
 from slotfilm_dist.messages import Observation, StepResult, TransitionBlock
 from slotfilm_dist.nets.agent import build_actor, build_encoder
 from slotfilm_dist.policy import AgentPolicy, Policy, RandomPolicy
 from slotfilm_dist.rollout import RolloutLoop
 from slotfilm_dist.seeds import Role, role_seed
 
-EnvFactory = Callable[[RunConfig, bool], VectorEnv]
+EnvFactory = Callable[[RunConfig, bool], AdjustableEnv]
 """Builds the environment of a run, with a camera or without; a function at the top of a module."""
 
 BUILD_LIMIT_S = 180.0
@@ -90,14 +91,14 @@ class WorkerLoop:
         self._worker_id = worker_id
         self._make_env = make_env
         self._limits = limits or Limits()
-        self._env: VectorEnv | None = None
+        self._env: AdjustableEnv | None = None
         self._built = threading.Event()
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
         self._mailbox: Mailbox | None = None
         self._sender: BlockSender | None = None
         self._rollout: RolloutLoop | None = None
-        self._incarnation = 0
+        self._incarnation, self._ended = 0, -1
         self._activity, self._limit_s, self._pulse_at = "nothing", self._limits.step_s, time.monotonic()
         self._num_steps = self._num_blocks = 0
         self._acting: ActingPolicy | None = None
@@ -111,7 +112,7 @@ class WorkerLoop:
         def policy(action_dim: int) -> Policy:
             return RandomPolicy(action_dim, self._seed(Role.RANDOM_ACTIONS, incarnation))
 
-        self._start(incarnation, mailbox, policy, Role.RANDOM_EPISODES)
+        self._start(incarnation, mailbox, policy, Role.RANDOM_EPISODES, self._config.random_episode_length)
 
     def take_random_blocks(self, timeout_s: float) -> list[TransitionBlock]:
         """Blocks of the random policy, at least one unless time runs out."""
@@ -139,7 +140,7 @@ class WorkerLoop:
             )
             return acting
 
-        self._start(incarnation, sender, policy, Role.EPISODES)
+        self._start(incarnation, sender, policy, Role.EPISODES, self._config.env.max_steps)
 
     def describe(self, timeout_s: float) -> tuple[int, tuple[str, ...]] | None:
         """Size of an action and names of the reward's terms, or None while the environment is being built."""
@@ -172,15 +173,24 @@ class WorkerLoop:
             weights_lags_s=self._acting.take_lags_s() if self._acting else (),
             num_rejected=self._rollout.num_rejected if self._rollout else 0,
             num_cut_episodes=self._rollout.num_cut_episodes if self._rollout else 0,
+            memory_share=used_memory_share(),
             error=self._error,
             error_reason=self._error_reason,
             running=self._thread is not None and self._thread.is_alive(),
+            ended=self._ended == self._incarnation,
         )
 
     def _seed(self, role: Role, incarnation: int) -> np.random.SeedSequence:
         return role_seed(self._config.seed, role, self._worker_id, incarnation)
 
-    def _start(self, incarnation: int, outlet: Outlet, make_policy: Callable[[int], Policy], episodes: Role) -> None:
+    def _start(
+        self,
+        incarnation: int,
+        outlet: Outlet,
+        make_policy: Callable[[int], Policy],
+        episodes: Role,
+        episode_steps: int,
+    ) -> None:
         assert self._thread is None or not self._thread.is_alive(), "stop comes first"
         self._stopping = threading.Event()
         self._incarnation = incarnation
@@ -190,15 +200,22 @@ class WorkerLoop:
         self._note("starting", self._limits.build_s)
         self._thread = threading.Thread(
             target=self._run,
-            args=(outlet, make_policy, self._seed(episodes, incarnation)),
+            args=(outlet, make_policy, self._seed(episodes, incarnation), episode_steps),
             name=f"worker-{self._worker_id}",
             daemon=True,
         )
         self._thread.start()
 
-    def _run(self, outlet: Outlet, make_policy: Callable[[int], Policy], seed: np.random.SeedSequence) -> None:
+    def _run(
+        self,
+        outlet: Outlet,
+        make_policy: Callable[[int], Policy],
+        seed: np.random.SeedSequence,
+        episode_steps: int,
+    ) -> None:
+        incarnation = self._incarnation
         try:
-            rollout = self._rollout = self._build(make_policy, seed)
+            rollout = self._rollout = self._build(make_policy, seed, episode_steps)
             self._await_weights()
             while not (self._stopping.is_set() or outlet.finished):
                 began = time.monotonic()
@@ -216,12 +233,16 @@ class WorkerLoop:
             if self._acting is not None:
                 self._acting.close()
             outlet.close()
+            self._ended = incarnation
 
-    def _build(self, make_policy: Callable[[int], Policy], seed: np.random.SeedSequence) -> RolloutLoop:
+    def _build(
+        self, make_policy: Callable[[int], Policy], seed: np.random.SeedSequence, episode_steps: int
+    ) -> RolloutLoop:
         if self._env is None:
             self._note("building the simulator", self._limits.build_s)
             self._env = self._make_env(self._config, self._config.encoder.uses_image)
             self._built.set()
+        self._env.episode_steps = episode_steps
         policy = make_policy(self._env.action_dim)
         self._note("starting the first episode", self._limits.build_s)
         watched = _WatchedEnv(self._env, self._note_reset, self._note_step)

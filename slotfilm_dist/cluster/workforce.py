@@ -1,5 +1,7 @@
 """The workers of a run as the backend drives them: random policy first, training after, cared for all the time."""
 
+import contextlib
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,12 +12,13 @@ from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
 from slotfilm_dist.cluster.hub_client import HubClient
 from slotfilm_dist.cluster.inference_client import InferenceClient
 from slotfilm_dist.cluster.messages import AgentSetup, BlockKey, HubStatus
-from slotfilm_dist.cluster.placement import WORKER_RESOURCE, share_for_more
+from slotfilm_dist.cluster.placement import WORKER_RESOURCE, nodes_for, share_for_more
 from slotfilm_dist.cluster.replay_client import ReplayClient, ShardClient
 from slotfilm_dist.cluster.role_clients import WorkerClient
 from slotfilm_dist.cluster.scaling import Load, WorkerScaler
 from slotfilm_dist.cluster.session import Session
-from slotfilm_dist.cluster.system import ShardWatch, Supervisor
+from slotfilm_dist.cluster.shard_watch import ShardWatch
+from slotfilm_dist.cluster.system import Supervisor
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.contracts import VectorEnv
 from slotfilm_dist.messages import TransitionBlock
@@ -74,7 +77,9 @@ class Workforce:
         self._failure: RunFailedError | None = None
         self._closing = threading.Event()
         self.watch: ShardWatch | None = None
-        self.supervisor = Supervisor(self._launch, self._employ, self._settle, first_incarnation)
+        self.supervisor = Supervisor(
+            *(self._launch, self._employ, self._settle, first_incarnation), config.runtime.max_memory_share
+        )
         self.supervisor.scale(config.runtime.num_workers)
         self._caretaker = threading.Thread(target=self._take_care, name="caretaker", daemon=True)
         self._caretaker.start()
@@ -93,13 +98,12 @@ class Workforce:
         """Size of an action and the reward's terms, from the first worker, once it has built its environment."""
         while True:
             self.check()
-            try:
-                described = self._clients()[0].describe(TAKE_S)
-            except (RoleLostError, RoleSilentError):
-                time.sleep(TICK_S)  # the caretaker replaces it
-                continue
-            if described is not None:
-                return described
+            for client in self._clients()[:1]:
+                with contextlib.suppress(RoleLostError, RoleSilentError):  # the caretaker replaces it
+                    described = client.describe(TAKE_S)
+                    if described is not None:
+                        return described
+            time.sleep(TICK_S / 10)
 
     def random_blocks(self, num_steps: int) -> Iterator[TransitionBlock]:
         """The random policy's blocks, as they come from any worker."""
@@ -135,17 +139,27 @@ class Workforce:
         """
         if not (counts.auto_workers and self.training):
             return
+        if self.supervisor.num_held:  # there is no memory for so many
+            self._hub.adapt_workers(max(1, counts.wanted_workers - self.supervisor.num_held))
+            return
         load = Load(
             at_s=time.monotonic(),
             wanted_workers=counts.wanted_workers,
             alive_workers=counts.alive_workers,
-            free_cpus=self._session.available_cpus(),
+            free_cpus=self._room(counts.alive_workers),
             learner_waited_s=learner_waited_s,
             workers_waited_s={beat.worker_id: beat.waited_s for beat in self.supervisor.beats()},
         )
         wanted = self._scaler.wanted(load)
         if wanted != counts.wanted_workers:
             self._hub.adapt_workers(wanted)
+
+    def _room(self, num_workers: int) -> float:
+        """Cores for more workers; on nodes that offer themselves to workers these ask Ray for none, so we count."""
+        on = nodes_for(self._session.nodes(), WORKER_RESOURCE)
+        if not self._session.place(WORKER_RESOURCE):
+            return self._session.available_cpus()
+        return sum(node.get("CPU", 0.0) for node in on) - num_workers * self._share_cpus
 
     def process_ids(self) -> dict[str, int]:
         """Of the workers' processes, by name."""
@@ -181,8 +195,8 @@ class Workforce:
         seed = role_seed(self._config.seed, Role.REPLAY, INSERT_STREAMS + handle.worker_id, incarnation)
         handle.train(incarnation, self._hub, ReplayClient(self._shards, seed), self._agent)
 
-    def _settle(self, worker_id: int, incarnation: int) -> None:
-        """Take back the steps that a lost worker was granted and that no shard holds."""
+    def _settle(self, worker_id: int, incarnation: int) -> int:
+        """Take back the steps that a worker was granted and that no shard holds, now that it is gone; gives them."""
         asked = self._hub.pending(worker_id, incarnation)
         stored: list[BlockKey] = []
         for shard in self._shards:
@@ -191,11 +205,12 @@ class Workforce:
                 stored += shard.fence(worker_id, incarnation, mine)
             except (RoleLostError, RoleSilentError):
                 continue  # what it held of this worker since its snapshot is lost with it
-        self._hub.settle(worker_id, incarnation, stored)
+        return self._hub.settle(worker_id, incarnation, stored)
 
     def _take_care(self) -> None:
         """The caretaker's loop: consumes beats, produces restarts and snapshots; ends with `close` or a failure."""
-        next_snapshot = time.monotonic() + self._snapshot_s
+        snapshot_s = self._snapshot_s if self._config.checkpoint.save_replay else math.inf
+        next_snapshot = time.monotonic() + snapshot_s
         while not self._closing.wait(TICK_S):
             try:
                 self.supervisor.tick()
@@ -206,7 +221,7 @@ class Workforce:
                     if time.monotonic() >= next_snapshot:
                         for shard in self._shards:
                             shard.begin_snapshot()
-                        next_snapshot = time.monotonic() + self._snapshot_s
+                        next_snapshot = time.monotonic() + snapshot_s
             except RunFailedError as error:
                 self._failure = error
                 return

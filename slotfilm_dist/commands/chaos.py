@@ -1,6 +1,7 @@
 """`slotfilm chaos`: damages a real run on purpose and says what followed."""
 
 import contextlib
+import math
 import signal
 import sys
 import tempfile
@@ -33,8 +34,10 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--markdown", action="store_true", help="print the table for a page")
     parser.add_argument("--keep", metavar="DIR", help="write the runs there and leave them (default: deleted)")
     options = parser.parse_args(arguments)
-    if options.minutes < 0 or options.soak < 0:
-        raise ValueError("--minutes and --soak must be 0 or more")
+    if not (0 <= options.minutes < math.inf and 0 <= options.soak < math.inf):
+        raise ValueError("--minutes and --soak must be numbers of 0 or more")
+    if options.keep and Path(options.keep).exists():
+        raise ValueError(f"--keep {options.keep}: is there already; give the name of a new folder")
     plan = FaultPlan.draw(options.faults or PLANS[options.plan], options.seed)
 
     from slotfilm_dist.chaos.outcome import Outcome, as_json, as_line, as_markdown, as_text

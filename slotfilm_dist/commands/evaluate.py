@@ -7,8 +7,15 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from slotfilm_dist.commands.options import Parser, build_config, parse_with_fields
-from slotfilm_dist.config import load_config
+from slotfilm_dist.commands.options import (
+    Parser,
+    add_device_option,
+    build_config,
+    episode_seeds,
+    parse_with_fields,
+    placed_on,
+)
+from slotfilm_dist.config_files import load_config
 
 PARTS = ("policy", "perception", "robustness", "film_strips", "reward_windows")
 
@@ -18,6 +25,7 @@ def main(arguments: Sequence[str]) -> int:
     options, fields = parse_with_fields(_parser(), arguments)
     if options.episodes is not None and options.episodes < 1:
         raise ValueError(f"--episodes {options.episodes}: must be 1 or more")
+    episode_seeds(options.seed, options.episodes or 50)
     if options.run and fields:
         raise ValueError(f"{fields[0]}: a run's own config decides; leave the fields away")
     if options.what == "policy":
@@ -76,6 +84,7 @@ def _parser() -> Parser:
         help="robustness: draw a corruption for every picture, or once an episode (default: %(default)s)",
     )
     parser.add_argument("--seed", type=int, default=10_000_000, help="first seed (default: %(default)s)")
+    add_device_option(parser)
     parser.add_argument("--artifacts", default="artifacts", metavar="DIR", help="data and encoders that runs share")
     parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
     return parser
@@ -86,24 +95,26 @@ def _play(options: argparse.Namespace, fields: Sequence[str]) -> int:
     if options.checkpoint != "last":
         raise ValueError(f"--checkpoint {options.checkpoint}: plain episodes take the newest one; leave it away")
     num_episodes = options.episodes or 50
+    seeds = episode_seeds(options.seed, num_episodes)
     player = options.policy or ("agent" if options.run else "")
     if not player or (player == "agent" and not options.run):
         raise ValueError("give the directory of a run, or --policy expert or --policy random")
     config = load_config(Path(options.run) / "config.json") if options.run else build_config("paper", "", fields)
+    config = placed_on(config, options.device)
 
     from slotfilm_dist.evaluation.record import save_evaluation, summarize
-    from slotfilm_dist.local import LocalBackend
+    from slotfilm_dist.local import LocalBackend, learner_device
     from slotfilm_dist.pipeline import POLICY_NAMES
     from slotfilm_dist.progress import Progress
 
+    learner_device(config, "--device")
     progress = Progress()
-    seeds = range(options.seed, options.seed + num_episodes)
     backend = LocalBackend(config)
     try:
         env_steps = backend.load_agent(Path(options.run) / "checkpoints") if player == "agent" else 0
         episodes = []
         progress.begin("evaluate", f"{num_episodes} episodes of the {POLICY_NAMES[player]} policy")
-        for episode in backend.play(player, seeds):
+        for episode in backend.play(player, seeds, lambda: False):
             episodes.append(episode)
             solved = sum(e.success_at_end for e in episodes) / len(episodes)
             progress.show(len(episodes), len(seeds), {"success": f"{solved:.0%}"})

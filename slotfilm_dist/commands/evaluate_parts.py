@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from slotfilm_dist.commands.heldout_frames import FrameRequest, acting_policy, heldout_frames
+from slotfilm_dist.commands.options import episode_seeds, placed_on
 from slotfilm_dist.commands.trained_agent import TrainedAgent, load_trained_agent
 from slotfilm_dist.envs.tasks import task_named
 from slotfilm_dist.evaluation.result_files import write_csv, write_json
@@ -38,11 +39,12 @@ def measure(part: str, options: argparse.Namespace) -> dict[str, Any]:
 
 def load(options: argparse.Namespace) -> TrainedAgent:
     """The run's networks, with torch on half of the cores: threads that wait for each other on a busy machine spin."""
-    from slotfilm_dist.config import load_config
+    from slotfilm_dist.config_files import load_config
 
     config = load_config(Path(options.run) / "config.json")
     torch.set_num_threads(config.runtime.learner_threads or max(1, int(usable_cores()) // 2))
-    return load_trained_agent(Path(options.run), options.checkpoint, learner_device(config), Path(options.artifacts))
+    device = learner_device(placed_on(config, options.device), "--device")
+    return load_trained_agent(Path(options.run), options.checkpoint, device, Path(options.artifacts))
 
 
 def describe(agent: TrainedAgent) -> dict[str, Any]:
@@ -133,7 +135,7 @@ def _robustness(options: argparse.Namespace, progress: Progress) -> dict[str, An
     agent = load(options)
     if not agent.config.encoder.uses_image:
         raise ValueError(f"{options.run}: variant {agent.config.variant!r} has no camera, so nothing can corrupt it")
-    seeds = range(options.seed, options.seed + (options.episodes or 50))
+    seeds = episode_seeds(options.seed, options.episodes or 50)
     policy = acting_policy(agent)
     evaluations: dict[str, Evaluation] = {}
     env = WristEnv(agent.config, camera=True)
@@ -182,7 +184,7 @@ def _film_strips(options: argparse.Namespace, progress: Progress) -> dict[str, A
         }
         policy = policies[player]()
         progress.begin("evaluate", f"film strips of the {player} policy")
-        for seed in range(options.seed, options.seed + (options.episodes or 2)):
+        for seed in episode_seeds(options.seed, options.episodes or 2):
             recorder = MomentRecorder()
             episode = next(play_episodes(env, policy, [seed], recorder))
             path = write_moments(recorder.moments, folder / f"{player}-{seed}.png")

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import shlex
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -11,7 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from slotfilm_dist.commands.options import FIELDS_NOTE, Parser, build_config, check_weights_file, parse_with_fields
-from slotfilm_dist.config import CheckpointConfig, RunConfig, RuntimeConfig, changed_fields, config_hash
+from slotfilm_dist.config import CheckpointConfig, RunConfig, RuntimeConfig
+from slotfilm_dist.config_files import changed_fields, config_hash
 from slotfilm_dist.presets import PRESETS, preset_named
 
 if TYPE_CHECKING:
@@ -30,6 +32,10 @@ SHOWN = ("key", "variant", "seed", "state", "num_starts", "worked_s", "error", "
 def main(arguments: Sequence[str]) -> int:
     """Run a grid; gives the exit code: 1 if a trial failed for good, 128 + n after signal n."""
     options, fields = parse_with_fields(_parser(), arguments)
+    if any(word.split("=")[0] == "--variant" for word in fields):
+        raise ValueError("--variant: a grid trains many; `--only A,B` takes some of them")
+    if any(not name.strip() for names in (*options.only, *options.exclude) for name in names.split(",")):
+        raise ValueError("--only and --exclude: a name is missing; was it an empty variable?")
     if options.retries < 0:
         raise ValueError(f"--retries {options.retries}: must be 0 or more")
     if options.max_concurrent < 0:
@@ -135,7 +141,7 @@ def _placed(
     A mode that the command line names holds. Otherwise a trial that has begun keeps its own, so that it goes on with
     its replay, and a new one runs on Ray where the cluster has a core for each of its roles, else in one process.
     """
-    from slotfilm_dist.config import load_config
+    from slotfilm_dist.config_files import load_config
     from slotfilm_dist.tuning.resources import fit_to_resources, job_resources, runs_on_ray
 
     named = any(word.split("=")[0] == "--runtime.mode" for word in fields)
@@ -217,7 +223,7 @@ def _run(
         return 0
     board = Board([(job, ledger.read(job)) for job in jobs if job.kind == "trial" or job.key in wanted])
     stop = StopFlag()
-    session = Session()
+    session = Session(metrics_port=jobs[0].config.runtime.metrics_port)
     try:
         nodes = session.nodes()
         placed, resources = _placed(options, fields, grid, jobs, nodes)
@@ -238,7 +244,7 @@ def _run(
             run_grid(todo, orders, limits, board, stop)
             stop.check()
     except Interrupted as interruption:
-        board.say(f"{interruption}; go on with the same command: slotfilm {' '.join(command)}")
+        board.say(f"{interruption}; go on with the same command: {shlex.join(('slotfilm', *command))}")
         return interruption.exit_code
     finally:
         session.close()
@@ -255,9 +261,8 @@ def _outcome(options: "argparse.Namespace", grid: Path, jobs: "Sequence[Job]", l
     for record in failed:
         console.print(f"  failed  {record.key}: {record.error}", soft_wrap=True, markup=False)
     counts = Counter(record.state for record in records)
-    console.print(
-        f"    grid  {', '.join(f'{number} {state}' for state, number in counts.items())}: {grid}", soft_wrap=True
-    )
+    states = ", ".join(f"{number} {state}" for state, number in counts.items())
+    console.print(f"    grid  {states}: {grid}", soft_wrap=True, markup=False)
     if options.json:
         trials = [{name: getattr(record, name) for name in SHOWN} for record in records]
         json.dump({"grid": str(grid), "states": counts, "trials": trials}, sys.stdout)

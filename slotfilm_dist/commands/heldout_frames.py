@@ -6,8 +6,10 @@ from pathlib import Path
 
 import torch
 
+from slotfilm_dist.commands.options import episode_seeds
 from slotfilm_dist.commands.trained_agent import TrainedAgent, load_trained_agent
-from slotfilm_dist.config import RunConfig, config_hash
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config_files import config_hash
 from slotfilm_dist.evaluation.labelled_frames import (
     LabelledFrames,
     collect_frames,
@@ -15,11 +17,10 @@ from slotfilm_dist.evaluation.labelled_frames import (
     load_frames,
     save_frames,
 )
+from slotfilm_dist.learning.learner import picture_identity
 from slotfilm_dist.policy import AgentPolicy, Policy, RandomPolicy
 from slotfilm_dist.progress import Progress
 from slotfilm_dist.seeds import Role, role_seed
-
-SOURCES = "random, expert, agent (the run's own) or the directory of another run, whose agent then acts"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -36,11 +37,12 @@ class FrameRequest:
     def __post_init__(self) -> None:
         if self.episodes < 1 or self.steps < 0:
             raise ValueError(f"--episodes {self.episodes} --steps {self.steps}: must be 1 or more, and 0 or more")
+        episode_seeds(self.first_seed, self.episodes)
 
     @property
     def seeds(self) -> Sequence[int]:
         """One seed an episode."""
-        return range(self.first_seed, self.first_seed + self.episodes)
+        return episode_seeds(self.first_seed, self.episodes)
 
     @property
     def label(self) -> str:
@@ -64,17 +66,31 @@ def heldout_frames(request: FrameRequest, agent: TrainedAgent, artifacts: Path, 
     actor = agent if request.source == "agent" else None
     if request.label.startswith("agent-of-"):
         actor = load_trained_agent(Path(request.source), "last", _device(agent), artifacts)
-    steps = min(request.steps or config.env.max_steps, config.env.max_steps)
-    who = actor.weights if actor else request.source
-    identity = {"who": who, "first_seed": request.first_seed, "episodes": request.episodes, "steps": steps}
-    name = config_hash(config.env, config.obs.state_fields, config.success, identity)
-    path = artifacts / f"frames-{name}.npz"
+    path = artifacts / frames_file(config, request, actor.weights if actor else request.source)
     if path.exists():
         progress.say(f"evaluate  held-out frames are there: {path}")
         return load_frames(path)
-    frames = _collect(config, request, steps, actor, progress)
+    frames = _collect(config, request, _num_steps(config, request), actor, progress)
     save_frames(frames, path)
     return frames
+
+
+def frames_file(config: RunConfig, request: FrameRequest, who: str) -> str:
+    """Name of the file of such frames: all that they depend on, and nothing else.
+
+    Args:
+        config: of the environment.
+        request: which frames.
+        who: acts: the source, or the weights of the agent that it stands for.
+    """
+    steps = _num_steps(config, request)
+    identity = {"who": who, "first_seed": request.first_seed, "episodes": request.episodes, "steps": steps}
+    identity |= picture_identity(config)
+    return f"frames-{config_hash(config.env, config.obs.state_fields, config.success, identity)}.npz"
+
+
+def _num_steps(config: RunConfig, request: FrameRequest) -> int:
+    return min(request.steps or config.env.max_steps, config.env.max_steps)
 
 
 def _collect(
@@ -82,7 +98,7 @@ def _collect(
 ) -> LabelledFrames:
     from slotfilm_dist.envs.wrist_env import WristEnv
 
-    # Reward's settings change no frame, and another variant's may differ: frames are shared between variants.
+    # Of the reward's settings only the target's radius can change a frame: variants of other rewards share frames.
     env = WristEnv(config, camera=True)
     try:
         policy = _policy(config, request.source, env, actor)

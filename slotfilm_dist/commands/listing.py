@@ -50,9 +50,12 @@ def cost(arguments: Sequence[str]) -> int:
     parser.add_argument("--out", metavar="DIR", help="also write cost.csv, cost.json and machine.json there")
     parser.add_argument("--json", action="store_true", help="print a list of JSON objects")
     options = parser.parse_args(arguments)
-    if not options.only:
+    names = [name for word in options.only for name in word.split(",") if name]
+    if not names:
         raise ValueError("--only: name at least one variant")
-    configs = [apply_variant(name, PRESETS["paper"]()) for name in options.only]
+    if options.out and Path(options.out).exists() and not Path(options.out).is_dir():
+        raise ValueError(f"--out {options.out}: is a file, not a folder")
+    configs = [apply_variant(name, PRESETS["paper"]()) for name in names]
 
     from slotfilm_dist.evaluation.cost import costs_of
     from slotfilm_dist.local import learner_device
@@ -65,7 +68,7 @@ def cost(arguments: Sequence[str]) -> int:
         )
         for config in configs
     ]
-    device = learner_device(placed[0])
+    device = learner_device(placed[0], "--device")
     rows = []
     for row in costs_of(placed, device):
         print(f"{row.variant}: {row.latency_ms_mean:.2f} ms on {row.device}", file=sys.stderr)

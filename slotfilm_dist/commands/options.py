@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config_files import from_dict, to_dict
 from slotfilm_dist.presets import PRESETS, preset_named
 from slotfilm_dist.variants import VARIANTS, apply_variant
 
@@ -25,6 +26,13 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message}; see `{self.prog} --help`")
+
+
+def episode_seeds(first: int, episodes: int) -> range:
+    """One seed an episode, from `--seed` on; raises ``ValueError`` where the simulator could not take them all."""
+    if not 0 <= first <= (1 << 31) - episodes:
+        raise ValueError(f"--seed {first}: must lie between 0 and {(1 << 31) - episodes}")
+    return range(first, first + episodes)
 
 
 def parse_with_fields(parser: Parser, arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
@@ -65,6 +73,18 @@ def add_config_options(parser: argparse.ArgumentParser, preset: str) -> None:
     parser.epilog = FIELDS_NOTE
 
 
+def add_device_option(parser: argparse.ArgumentParser) -> None:
+    """Where a trained run's networks compute, for `placed_on`."""
+    parser.add_argument(
+        "--device", choices=("auto", "cpu", "cuda"), help="where networks compute (default: as the run was trained)"
+    )
+
+
+def placed_on(config: RunConfig, device: str | None) -> RunConfig:
+    """The config, computing on this device instead of its own if one is named."""
+    return replace(config, runtime=replace(config.runtime, device=device or config.runtime.device))
+
+
 def build_config(preset: str, variant: str, fields: Sequence[str], *, show_fields: bool = False) -> RunConfig:
     """The config that a command line asks for.
 
@@ -77,14 +97,16 @@ def build_config(preset: str, variant: str, fields: Sequence[str], *, show_field
     Raises:
         ValueError: an unknown name (with the nearest known one) or an impossible value.
     """
-    from slotfilm_dist.envs.tasks import adapt_config
+    from slotfilm_dist.envs.tasks import adapt_config, check_goal
 
     base = preset_named(preset)
     task = _value_of(fields, "--env.task")
     if task:
         base = replace(base, env=replace(base.env, task=task))
     base = apply_variant(variant or base.variant, adapt_config(base))
-    return change_fields(base, ["--help"] if show_fields else fields)
+    config = change_fields(base, ["--help"] if show_fields else fields)
+    check_goal(config)
+    return config
 
 
 def change_fields(base: RunConfig, fields: Sequence[str]) -> RunConfig:
@@ -98,11 +120,12 @@ def change_fields(base: RunConfig, fields: Sequence[str]) -> RunConfig:
     shown = io.StringIO()
     try:
         with contextlib.redirect_stderr(shown):
-            return tyro.cli(RunConfig, default=base, args=fields, prog="slotfilm train", use_underscores=True)
+            changed = tyro.cli(RunConfig, default=base, args=fields, prog="slotfilm train", use_underscores=True)
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
         raise ValueError(_refusal(fields, shown.getvalue())) from None
+    return from_dict(RunConfig, to_dict(changed))
 
 
 def check_weights_file(config: RunConfig) -> None:
@@ -130,7 +153,9 @@ def _refusal(fields: Sequence[str], shown: str) -> str:
     lines = [line.strip(" |│╭╮╰╯─\n") for line in shown.splitlines()]
     text = " ".join(line for line in lines if line and "--help" not in line)
     text = re.sub(r"[-─]{4,}", "", text).strip()
-    text = re.sub(r"^(Invalid choice|Unrecognized options|Missing argument|Value error)\s+", "", text)
+    if text.startswith("Unrecognized options"):
+        return f"{text}; the preset comes first, and no_ turns a yes/no field off, as in --obs.no_normalize_state"
+    text = re.sub(r"^(Invalid choice|Missing argument|Value error)\s+", "", text)
     match = re.search(r"Error parsing (\S+): (.*?)(?: Argument helptext:.*)?$", text)
     if match is None:
         return text

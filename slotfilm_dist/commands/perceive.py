@@ -9,8 +9,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from slotfilm_dist.commands.options import Parser
-from slotfilm_dist.config import load_config
+from slotfilm_dist.commands.options import Parser, placed_on
+from slotfilm_dist.config_files import load_config
 
 if TYPE_CHECKING:
     from slotfilm_dist.evaluation.perceived_output import Output
@@ -93,14 +93,15 @@ def _parser() -> Parser:
 def _outputs(options: argparse.Namespace) -> "list[Output]":
     from slotfilm_dist.evaluation.perceived_output import open_output, open_window
 
-    outputs = [open_output(Path(options.out), FPS)] if options.out else []
+    out, source = Path(options.out), Path(options.source)
+    if options.out and source.exists() and out.resolve() == source.resolve():
+        raise ValueError(f"--out {options.out}: would overwrite what is looked at; choose another place")
+    outputs = [open_output(out, FPS)] if options.out else []
     return [*outputs, open_window()] if options.show else outputs
 
 
 def _run(options: argparse.Namespace, outputs: "list[Output]") -> Iterator[dict[str, Any]]:
     """Perceive one picture after another; gives the summary so far after each."""
-    import dataclasses
-
     import torch
 
     from slotfilm_dist.commands.trained_agent import load_trained_agent
@@ -112,9 +113,9 @@ def _run(options: argparse.Namespace, outputs: "list[Output]") -> Iterator[dict[
 
     run_dir = Path(options.checkpoint)
     config = load_config(run_dir / "config.json")
-    placed = dataclasses.replace(config, runtime=dataclasses.replace(config.runtime, device=options.device))
     torch.set_num_threads(config.runtime.learner_threads or max(1, int(usable_cores()) // 2))
-    agent = load_trained_agent(run_dir, options.which, learner_device(placed), Path(options.artifacts))
+    device = learner_device(placed_on(config, options.device), "--device")
+    agent = load_trained_agent(run_dir, options.which, device, Path(options.artifacts))
     encoder = agent.slots("perceive")
     objects = task_named(config.env.task).objects
     matched = config.encoder.vis_head == "matched"

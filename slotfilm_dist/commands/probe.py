@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from slotfilm_dist.commands.options import Parser
-from slotfilm_dist.config import load_config
+from slotfilm_dist.commands.options import Parser, add_device_option, episode_seeds
+from slotfilm_dist.config_files import load_config
 
 if TYPE_CHECKING:
     from slotfilm_dist.evaluation.probes import ProbeResult
@@ -37,11 +37,13 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument(
         "--checkpoint", choices=("last", "best"), default="last", help="newest, or best during training"
     )
+    add_device_option(parser)
     parser.add_argument("--artifacts", default="artifacts", metavar="DIR", help="data and encoders that runs share")
     parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
     options = parser.parse_args(arguments)
     if options.episodes < 2:
         raise ValueError(f"--episodes {options.episodes}: must be 2 or more, to test on episodes not trained on")
+    episode_seeds(options.seed, options.episodes)
     load_config(Path(options.run) / "config.json")
 
     from slotfilm_dist.evaluation.result_files import plain

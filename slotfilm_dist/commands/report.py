@@ -2,14 +2,14 @@
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from slotfilm_dist.commands.options import Parser
 
 if TYPE_CHECKING:
-    from slotfilm_dist.evaluation.study.collection import Trial
+    from slotfilm_dist.evaluation.study.collection import Grid, Trial
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -31,7 +31,7 @@ def main(arguments: Sequence[str]) -> int:
     from slotfilm_dist.evaluation.study.collection import collect_study
     from slotfilm_dist.evaluation.study.report import write_study
 
-    study = collect_study(folder, _trials(folder), _commands(folder))
+    study = collect_study(folder, list(_grids(folder)))
     report = write_study(study, Path(options.out) if options.out else folder / "report")
     items = report.summary["items"]
     num_shown = sum(item["shown"] for item in items)
@@ -43,27 +43,37 @@ def main(arguments: Sequence[str]) -> int:
 def _parser() -> Parser:
     parser = Parser(
         prog="slotfilm report",
-        description="Of a run, finished or not: write its report.html. Of a folder of runs, or of a grid: every figure "
-        "and table of the paper that the runs support, beside what the paper printed, as report.html, report.md, "
-        "figures/*.png and tables/*.csv; what is missing is named with the command that would make it.",
+        description="Of a run, finished or not: write its report.html. Of a grid, or of a folder of runs and grids: "
+        "every figure and table of the paper that the runs support, beside what the paper printed, as report.html, "
+        "report.md, figures/*.png and tables/*.csv; what is missing is named with the command that would make it.",
     )
-    parser.add_argument("run", help="directory of a run, folder of runs, or directory of a grid")
+    parser.add_argument("run", help="directory of a run or of a grid, or a folder of runs and grids")
     parser.add_argument("--out", default="", metavar="DIR", help="folder of a study's report (default: report in it)")
     parser.add_argument("--json", action="store_true", help="print what was written as one JSON object")
     return parser
 
 
+def _grids(folder: Path) -> "Iterator[Grid]":
+    """The grids that a folder is or holds."""
+    from slotfilm_dist.evaluation.study.collection import Grid, folders_of_runs
+
+    for path in folders_of_runs(folder):
+        trials, commands = _trials(path), _commands(path)
+        if trials or commands:
+            yield Grid(path=path, trials=tuple(trials), commands=tuple(commands))
+
+
 def _trials(folder: Path) -> "list[Trial]":
     """Jobs of a grid's ledger; none for a folder of runs."""
     from slotfilm_dist.evaluation.study.collection import Trial
-    from slotfilm_dist.tuning.ledger import LEDGER
+    from slotfilm_dist.tuning.ledger import LEDGER, directory_of
 
     trials = []
     for values in map(_object, sorted((folder / LEDGER).glob("*.json"))):
         if {"key", "kind", "variant", "seed", "state"} <= values.keys():
             trials.append(
                 Trial(
-                    key=values["key"],
+                    path=directory_of(folder, values["key"], values["kind"]),
                     kind=values["kind"],
                     variant=values["variant"],
                     seed=values["seed"],

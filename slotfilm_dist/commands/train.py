@@ -1,5 +1,6 @@
 """`slotfilm train`: a run from nothing to its report, or on from where it stopped."""
 
+import argparse
 import contextlib
 import json
 import sys
@@ -16,16 +17,20 @@ from slotfilm_dist.commands.options import (
     parse_with_fields,
 )
 from slotfilm_dist.commands.scale import AUTO, workers_wanted
-from slotfilm_dist.config import RunConfig, load_config
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config_files import load_config
 
 if TYPE_CHECKING:
     from slotfilm_dist.backend import Backend
+
+DEFAULT_PRESET = "quick"
 
 
 def main(arguments: Sequence[str]) -> int:
     """Train; gives the exit code."""
     parser = Parser(prog="slotfilm train", description="Collect, pre-train, train, evaluate; then write a report.")
-    add_config_options(parser, "quick")
+    add_config_options(parser, DEFAULT_PRESET)
+    parser.set_defaults(preset="")
     parser.add_argument(
         "--workers",
         type=workers_wanted,
@@ -33,7 +38,7 @@ def main(arguments: Sequence[str]) -> int:
         help="environment workers on Ray; auto adds and removes them as the learner needs them",
     )
     parser.add_argument("--resume", metavar="DIR", help="go on with the run in this directory")
-    parser.add_argument("--runs", default="runs", metavar="DIR", help="where run directories go (default: %(default)s)")
+    parser.add_argument("--runs", metavar="DIR", help="where run directories go (default: runs)")
     parser.add_argument("--name", default="", help="name of the run directory (default: preset, variant, seed, number)")
     parser.add_argument(
         "--artifacts",
@@ -48,15 +53,24 @@ def main(arguments: Sequence[str]) -> int:
 
     from slotfilm_dist.runs import new_run_directory
 
-    if options.resume:
-        if options.variant or options.name:
-            raise ValueError(f"--resume {options.resume}: leave --variant and --name away; the run has its own")
+    if options.resume is not None and not options.fields:
+        _refuse_beside_resume(options)
         path = Path(options.resume)
         config = _resumed_config(path, fields)
     else:
-        config = build_config(options.preset, options.variant, fields, show_fields=options.fields)
-        path = new_run_directory(Path(options.runs), config, options.preset, options.name)
+        preset = options.preset or DEFAULT_PRESET
+        config = build_config(preset, options.variant, fields, show_fields=options.fields)
+        path = new_run_directory(Path(options.runs or "runs"), config, preset, options.name)
     return _execute(path, config, Path(options.artifacts), as_json=options.json)
+
+
+def _refuse_beside_resume(options: argparse.Namespace) -> None:
+    if not options.resume:
+        raise ValueError("--resume: the directory of the run is missing; was it an empty variable?")
+    given = {"--variant": options.variant, "--name": options.name, "--runs": options.runs, "a preset": options.preset}
+    beside = [name for name, value in given.items() if value]
+    if beside:
+        raise ValueError(f"--resume {options.resume}: leave {' and '.join(beside)} away; the run has its own")
 
 
 def workers_fields(workers: int) -> list[str]:

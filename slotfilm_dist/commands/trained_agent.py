@@ -6,7 +6,8 @@ from typing import Literal
 
 import torch
 
-from slotfilm_dist.config import RunConfig, load_config
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config_files import load_config
 from slotfilm_dist.learning.checkpoint import Checkpoint, CheckpointStore, read_checkpoint
 from slotfilm_dist.learning.learner import learning_hash, pretrain_hash
 from slotfilm_dist.nets.agent import AgentActor, AgentEncoder, build_actor, build_encoder
@@ -37,7 +38,7 @@ class TrainedAgent:
     @property
     def has_trained_heads(self) -> bool:
         """Whether pre-training taught the UV and visibility heads anything."""
-        return self.config.encoder.uses_image and self.config.pretrain.steps > 0
+        return self.config.pretrains
 
     def slots(self, purpose: str) -> SlotFusionEncoder:
         """The encoder, if it has slots; raises ``ValueError`` for an agent without."""
@@ -101,7 +102,7 @@ def _read(run_dir: Path, config: RunConfig, which: Which, artifacts: Path) -> Ch
                 "(evaluation.every_steps); use --checkpoint last"
             )
         return read_checkpoint(folder / "best", learning_hash(config))
-    if not config.encoder.uses_image or config.pretrain.steps == 0:
+    if not config.pretrains:
         raise ValueError(f"{run_dir}: variant {config.variant!r} has no pre-training; use --checkpoint last")
     return read_checkpoint(artifacts / f"encoder-{pretrain_hash(config)}")
 

@@ -1,6 +1,7 @@
 """`slotfilm watch`: the newest metrics of a run, live in a terminal."""
 
 import json
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,7 +42,7 @@ class MetricsFile:
                 if not line.endswith(b"\n"):
                     break
                 self._offset += len(line)
-                self.values |= {k: v for k, v in _parsed(line).items() if v is not None}
+                self.values |= _parsed(line)
 
     def age_s(self) -> float:
         """Seconds since the run wrote last."""
@@ -49,11 +50,23 @@ class MetricsFile:
 
 
 def _parsed(line: bytes) -> dict[str, Any]:
+    """What this version knows of a line: declared metrics that are numbers, and the phase."""
     try:
         values = json.loads(line)
-    except (UnicodeDecodeError, json.JSONDecodeError):
+    except (ValueError, RecursionError):
         return {}
-    return values if isinstance(values, dict) else {}
+    return {k: v for k, v in values.items() if _is_shown(k, v)} if isinstance(values, dict) else {}
+
+
+def _is_shown(key: str, value: object) -> bool:
+    if key == "phase":
+        return isinstance(value, str)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return False
+    try:
+        return key in AXES or bool(find_metric(key))
+    except ValueError:  # of another version
+        return False
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -64,6 +77,8 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--once", action="store_true", help="show the present values and leave")
     parser.add_argument("--json", action="store_true", help="print the present values as one JSON object and leave")
     options = parser.parse_args(arguments)
+    if not options.every >= 0.01:
+        raise ValueError(f"--every {options.every:g}: must be 0.01 s or more")
     run = Path(options.run)
     if not (run / "config.json").exists():
         raise ValueError(f"{run} is no directory of a run: it has no config.json")

@@ -19,7 +19,8 @@ from torch import Tensor, nn
 
 from slotfilm_dist import __version__
 from slotfilm_dist.atomic import file_digest, replace_directory
-from slotfilm_dist.config import RunConfig, load_config, to_dict
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config_files import load_config, to_dict
 from slotfilm_dist.deploy.loader import FILES, FORMAT, MANIFEST, BackendName, PolicyInput, load_policy
 from slotfilm_dist.learning.checkpoint import Checkpoint, CheckpointStore, read_checkpoint
 from slotfilm_dist.learning.learner import Learner, learning_hash

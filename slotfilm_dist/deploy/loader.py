@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Float32, Shaped
 
 from slotfilm_dist.atomic import FileDigest, check_file
-from slotfilm_dist.config import RunConfig, from_dict
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config_files import from_dict
 
 MANIFEST = "policy.json"
 FORMAT = 1

@@ -24,7 +24,8 @@ from transforms3d.euler import euler2quat
 from slotfilm_dist.config import EnvConfig, RewardConfig, SuccessConfig
 from slotfilm_dist.envs.meshes import object_files
 from slotfilm_dist.envs.panda import SlotfilmPanda
-from slotfilm_dist.envs.reward import Progress, RewardTerms, max_reward, progress, reward_inputs, reward_terms
+from slotfilm_dist.envs.reward import Progress, RewardTerms, progress, reward_inputs, reward_terms
+from slotfilm_dist.envs.reward_bounds import max_reward
 from slotfilm_dist.envs.scene import SceneReader, SceneState
 
 CONTROL_HZ = 20
@@ -187,6 +188,11 @@ class PickBananaEnv(BaseEnv):
 
     def _after_control_step(self) -> None:
         self._state = None
+
+    def set_state_dict(self, *arguments: Any, **keywords: Any) -> Any:
+        """ManiSkill's; also what a reset to given states calls."""
+        self._state = None
+        return super().set_state_dict(*arguments, **keywords)
 
     def scene_state(self) -> SceneState:
         """The simulator's state after the last control step, read once."""

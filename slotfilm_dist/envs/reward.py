@@ -130,7 +130,7 @@ def reward_terms(now: RewardInputs, config: RewardConfig) -> RewardTerms:
     velocity = now.qvel[:, :ARM_JOINTS] if config.static_joints == "arm" else now.qvel
     speed = torch.linalg.vector_norm(velocity, ord=2 if config.static_norm == "l2" else float("inf"), dim=-1)
     weights = config.weights
-    scale = 1.0 / weights.total if config.normalize == "sum" else 1.0
+    scale = 1.0 / config.divisor
     return RewardTerms(
         reach=shaped(now.object_to_tcp_m, config) * (weights.reach * scale),
         grasp=grasped * (weights.grasp * scale),
@@ -156,11 +156,3 @@ def rewards_of(inputs: Float32[np.ndarray, "rows inputs"], config: RewardConfig)
 def num_reward_inputs(term_names: tuple[str, ...]) -> int:
     """Numbers stored with a step in an environment whose reward has these components; 0 if it is not this reward."""
     return NUM_INPUTS if term_names == TERMS else 0
-
-
-def max_reward(config: RewardConfig) -> float:
-    """Upper bound of one step's reward, the divisor of ManiSkill's normalised dense reward."""
-    near = {"bounded": 1.0, "inverse": config.near_cap, "exp_only": 1.0}[config.near_form]
-    weights = config.weights
-    total = weights.reach * near + weights.grasp + weights.place * near + weights.post_grasp + weights.static
-    return total / weights.total if config.normalize == "sum" else total

@@ -64,7 +64,14 @@ def adapt_config(config: RunConfig) -> RunConfig:
         obs = dataclasses.replace(obs, num_objects=num_objects, state_dim=obs.state_dim + extra)
     if encoder.num_slots == defaults.encoder.num_slots:
         encoder = dataclasses.replace(encoder, num_slots=max(num_objects, 1))
-    check(
-        not encoder.goal or bool(task.goal), "encoder.goal", encoder.goal, f"{task.env_id} has no goal point to query"
-    )
     return dataclasses.replace(config, env=env, obs=obs, encoder=encoder)
+
+
+def check_goal(config: RunConfig) -> None:
+    """Raise ``ValueError`` if the encoder queries a goal that the task does not have."""
+    task = task_named(config.env.task)
+    want = (
+        f"{task.env_id} has no goal point to query; leave --encoder.goal and the variant slotfilm_goal away "
+        "(of a grid: --exclude slotfilm_goal)"
+    )
+    check(not config.encoder.goal or bool(task.goal), "encoder.goal", config.encoder.goal, want)

@@ -70,7 +70,13 @@ class WristEnv:
             raise ValueError(f"env.control_mode = {config.env.control_mode!r}: {error}") from None
         except RuntimeError as error:
             raise ValueError(_cannot_build(config, str(error), camera=camera)) from error
-        self.action_dim = int(self._env.single_action_space.shape[0])
+        actions = self._env.single_action_space
+        if not (np.all(actions.low == -1) and np.all(actions.high == 1)):
+            raise ValueError(
+                f"env.control_mode = {config.env.control_mode!r}: its actions are absolute and not in [-1, 1], as a "
+                "policy's are; take pd_ee_delta_pose, pd_ee_delta_pos or pd_joint_delta_pos"
+            )
+        self.action_dim = int(actions.shape[0])
         self.reward_term_names: tuple[str, ...] = TERMS if own else ("reward",)
         self._attach()
         self._elapsed = np.zeros(num_envs, np.int64)

@@ -47,11 +47,6 @@ def pictures(source: str, timeout_s: float) -> Iterator[Picture]:
     return iter([read_image(path)])
 
 
-def is_live(source: str) -> bool:
-    """Whether the source goes on whether or not one keeps up."""
-    return source.isdigit() or source.startswith(("http://", "https://"))
-
-
 def read_image(path: Path) -> Picture:
     """One image file; raises ``ValueError`` if it is none."""
     try:

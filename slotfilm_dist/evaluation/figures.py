@@ -6,6 +6,7 @@ Smoothing is causal everywhere: no curve rises before the event that made it ris
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -27,11 +28,13 @@ from slotfilm_dist.evaluation.figure_style import (
     steps_axis,
     values_axis,
 )
-from slotfilm_dist.evaluation.record import RunRecord
+from slotfilm_dist.evaluation.record import Points, RunRecord
 from slotfilm_dist.evaluation.statistics import causal_mean
 from slotfilm_dist.metrics import METRICS
 
 _EPISODE_WINDOW = 100
+_Line = Callable[[Any], Any]
+"""Of a number or an array."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -113,7 +116,7 @@ def _episode_window(record: RunRecord) -> int:
 
 
 def _draw_return(record: RunRecord, figure: Figure) -> str:
-    trained = [e for e in record.evaluations if e.name != "random"]
+    trained = record.of_agent
     if not record.episodes and not trained:
         return ""
     figure.set_size_inches(10, 5)
@@ -152,16 +155,31 @@ def _draw_return(record: RunRecord, figure: Figure) -> str:
 
 
 def _episode_axis(axes: Axes, steps: Float64[np.ndarray, " episodes"]) -> None:
-    if len(steps) < 2:
-        return
-    numbers = np.arange(1, len(steps) + 1, dtype=np.float64)
-    per_episode = steps[-1] / numbers[-1]
-    top = axes.secondary_xaxis("top", functions=(lambda x: x / per_episode, lambda n: n * per_episode))
-    top.set_xlabel("episodes")
+    if steps.any():
+        axes.secondary_xaxis("top", functions=episode_counts(steps)).set_xlabel("episodes")
+
+
+def episode_counts(steps: Float64[np.ndarray, " episodes"]) -> tuple[_Line, _Line]:
+    """Functions from steps to the number of this run's episodes that had ended by then, and back.
+
+    They go through every episode, whatever its length, and on at the mean length beyond the last.
+
+    Args:
+        steps: at the end of each episode, in order; several may have ended at the same one.
+    """
+    ends, counts = np.unique(np.append(0.0, steps), return_counts=True)
+    numbers = np.cumsum(counts) - 1.0
+    return _through(ends, numbers), _through(numbers, ends)
+
+
+def _through(x: Points, y: Points) -> _Line:
+    """Linear between rising points, and with their mean slope before the first and after the last."""
+    slope = y[-1] / x[-1]
+    return lambda at: np.interp(at, x, y) + slope * (at - np.clip(at, x[0], x[-1]))
 
 
 def _draw_success(record: RunRecord, figure: Figure) -> str:
-    trained = [e for e in record.evaluations if e.name != "random"]
+    trained = record.of_agent
     if not record.episodes and not trained:
         return ""
     figure.set_size_inches(10, 4.2)

@@ -1,6 +1,6 @@
 """Film strips of an episode's moments: reach, grasp, transport, place, hold (Figure 8)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,13 +60,14 @@ def _moment(rgb: UInt8[np.ndarray, "height width 3"], step: StepResult | None) -
 def key_steps(moments: Sequence[Moment]) -> list[tuple[int, str]]:
     """Which moments to show, and what each shows.
 
-    reach      half of the way to the first grasp
+    reach      half of the way to the grasp
     grasp      the first grasp that lasts until the object is placed, or the first one
-    transport  halfway from there to the first placement, or to the end
+    transport  halfway through the grasped moments between that and the placement, or the end
     place      first grasped and within the target region
-    hold       the last moment
+    hold       the last moment, if still placed and grasped
 
-    A phase that the episode never reached is not shown; evenly spaced moments fill its place, named by their step.
+    A moment that is several of these has the first of the names. In the place of what is then missing comes the moment
+    furthest from all that are shown, named by its step: in an episode without a grasp they are evenly spaced.
 
     Raises:
         ValueError: no moments.
@@ -74,19 +75,34 @@ def key_steps(moments: Sequence[Moment]) -> list[tuple[int, str]]:
     if not moments:
         raise ValueError("there are no moments: record an episode first")
     last = len(moments) - 1
+    chosen: dict[int, str] = {}
+    for step, name in _phases(moments):
+        chosen.setdefault(step, name)
+    if not chosen:
+        chosen[0] = "step 0"
+    chosen.setdefault(last, f"step {last}")
+    while len(chosen) < min(PANELS, len(moments)):
+        step = max(range(len(moments)), key=lambda i: min(abs(i - other) for other in chosen))
+        chosen[step] = f"step {step}"
+    return sorted(chosen.items())
+
+
+def _phases(moments: Sequence[Moment]) -> Iterator[tuple[int, str]]:
+    """Moments of the phases that the episode reached, in their order; none without a grasp."""
     grasped = [i for i, m in enumerate(moments) if m.grasped]
     if not grasped:
-        steps = np.unique(np.linspace(0, last, PANELS).round().astype(int)).tolist()
-        return [(i, f"step {i}") for i in steps]
-    placed = next((i for i, m in enumerate(moments) if m.placed and m.grasped), None)
-    before = [i for i in grasped if placed is None or i <= placed]
-    grasp = _start_of_last_run(before) if placed is not None else before[0]
-    chosen = [(grasp // 2, "reach"), (grasp, "grasp"), ((grasp + (placed or last)) // 2, "transport")]
+        return
+    last = len(moments) - 1
+    placed = next((i for i in grasped if moments[i].placed), None)
+    grasp = grasped[0] if placed is None else _start_of_last_run([i for i in grasped if i <= placed])
+    yield grasp // 2, "reach"
+    yield grasp, "grasp"
+    if held := [i for i in grasped if grasp < i < (last if placed is None else placed)]:
+        yield held[len(held) // 2], "transport"
     if placed is not None:
-        chosen.append((placed, "place"))
-    final = "hold" if moments[last].grasped and moments[last].placed else f"step {last}"
-    chosen.append((last, final))
-    return list(dict(sorted(chosen)).items())
+        yield placed, "place"
+        if moments[last].grasped and moments[last].placed:
+            yield last, "hold"
 
 
 def _start_of_last_run(indices: Sequence[int]) -> int:

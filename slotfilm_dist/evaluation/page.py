@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from slotfilm_dist.config import RunConfig, changed_fields, to_dict
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config_files import changed_fields, to_dict
 from slotfilm_dist.evaluation import page_parts as html
 from slotfilm_dist.evaluation.figures import draw_figures
 from slotfilm_dist.evaluation.page_tables import (
@@ -91,14 +92,15 @@ def _headline(record: RunRecord) -> str:
         _position_card(record),
         _progress_card(record),
     ]
+    verdict = html.paragraph(_verdict(record, best, difference), "verdict")
     return (
         f"<header><h1>{html.escape(_title(record))}</h1>{html.paragraph(subtitle, 'muted')}{_phases(record)}"
-        f"{html.paragraph(_verdict(best, difference), 'verdict')}<div class='cards'>{''.join(cards)}</div></header>"
+        f"{verdict}<div class='cards'>{''.join(cards)}</div></header>"
     )
 
 
 def _phases(record: RunRecord) -> str:
-    finished = record.evaluation("final") is not None
+    finished = record.final is not None
     words = [str(line["phase"]) for line in record.lines if line.get("phase") in PHASES]
     now = len(PHASES) if finished else PHASES.index(words[-1]) if words else -1
     items = []
@@ -108,10 +110,10 @@ def _phases(record: RunRecord) -> str:
     return f"<ol class='phases' aria-label='Phases of the run'>{''.join(items)}</ol>"
 
 
-def _verdict(best: Evaluation | None, difference: PairedDifference | None) -> str:
+def _verdict(record: RunRecord, best: Evaluation | None, difference: PairedDifference | None) -> str:
     if best is None:
         return "Nothing was evaluated yet, so this page cannot say how good the policy is."
-    which = "The final policy" if best.name == "final" else f"The policy after {html.number(best.env_steps, 0)} steps"
+    which = "The final policy" if best is record.final else f"The policy after {html.number(best.env_steps, 0)} steps"
     if difference is None:
         return f"{which} was evaluated, but not the random policy on the same seeds: its return has no yardstick."
     low, high = difference.interval

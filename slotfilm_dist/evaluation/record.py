@@ -1,23 +1,30 @@
 """What a run directory says: its files read into typed records, with a name for everything that is missing.
 
 A run that is still going, was cut short or is damaged in part is read as far as it goes; each gap becomes one sentence
-in `RunRecord.missing`. A run that was resumed repeats some steps: what the repetition replaced is left out.
+in `RunRecord.missing`. A run that was resumed repeats some steps: what the repetition replaced is left out. Random data
+that had to be collected once more replace the data alone, not what was learned since.
 """
 
 import dataclasses
 import json
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
-from slotfilm_dist.config import RunConfig, load_config
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config_files import load_config
 from slotfilm_dist.evaluation.statistics import not_superseded, wilson_interval
 from slotfilm_dist.messages import EpisodeSummary
 
+AGENT = "trained, deterministic"
+"""What `Evaluation.policy` says of a run's own agent."""
+BEFORE_RL = ("collect", "pretrain")
+"""Phases that a resumed run may go through once more while its agent has trained for long."""
 Points = Float64[np.ndarray, " points"]
 
 
@@ -108,10 +115,10 @@ class RunRecord:
 
     def series(self, key: str, axis: str = "env_steps") -> tuple[Points, Points]:
         """A metric over an axis: positions and values, without nulls and what a resume replaced."""
-        pairs = [(r[axis], r[key]) for r in self.lines if _is_number(r.get(key)) and _is_number(r.get(axis))]
-        x, y = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
-        keep = not_superseded(x)
-        return x[keep], y[keep]
+        lines = [r for r in self.lines if _is_number(r.get(key)) and _is_number(r.get(axis))]
+        x, y = np.array([(r[axis], r[key]) for r in lines], dtype=np.float64).reshape(-1, 2).T
+        kept = _not_repeated(x, [r.get("phase") in BEFORE_RL for r in lines])
+        return x[kept], y[kept]
 
     def last(self, key: str) -> float | None:
         """The newest value of a metric; None if it was never written."""
@@ -122,10 +129,21 @@ class RunRecord:
         return next((e for e in self.evaluations if e.name == name), None)
 
     @property
+    def final(self) -> Evaluation | None:
+        """The agent's evaluation at the end of its training; one that was made before the run was extended is not."""
+        found = self.evaluation("final")
+        planned = self.config.schedule.total_steps if self.config else 0
+        return found if found and found.env_steps >= planned else None
+
+    @property
+    def of_agent(self) -> list[Evaluation]:
+        """Evaluations of what the run trained: not of the random policy, nor of the expert."""
+        return [e for e in self.evaluations if e.policy == AGENT]
+
+    @property
     def best_known(self) -> Evaluation | None:
-        """The final evaluation, or while there is none the one that had learned from most steps."""
-        trained = [e for e in self.evaluations if e.name != "random"]
-        return self.evaluation("final") or (trained[-1] if trained else None)
+        """The agent's final evaluation, or while there is none the one that had learned from most steps."""
+        return self.final or (self.of_agent[-1] if self.of_agent else None)
 
     @property
     def reward_term_names(self) -> tuple[str, ...]:
@@ -151,25 +169,30 @@ def read_run(run_dir: Path) -> RunRecord:
         versions=_json_object(run_dir / "versions.json", missing, "versions, machine and command are unknown"),
         lines=lines,
         episodes=_episodes(run_dir / "episodes.jsonl", missing),
-        evaluations=_evaluations(run_dir / "evaluation", missing),
+        evaluations=_evaluations(run_dir / "evaluation", missing, _replaced_steps(lines)),
         videos=tuple(sorted((run_dir / "videos").glob("*.mp4"))),
         missing=missing,
     )
-    if not record.evaluation("final"):
+    if not record.final:
         missing.append(
-            "evaluation/final.json: the run has no final evaluation yet; `slotfilm evaluate` on this run writes it."
+            "evaluation/final.json: the run has no final evaluation yet; `slotfilm train --resume` on it writes one."
         )
     if not record.evaluation("random"):
         missing.append(
             "evaluation/random.json: the random policy was not evaluated, so nothing says what chance gives."
         )
     if not record.videos:
-        missing.append("videos/*.mp4: no rollout was recorded; set evaluation.videos to 1 or more and evaluate.")
+        missing.append("videos/*.mp4: no rollout was recorded; evaluation.videos is how many the end of a run records.")
     return record
 
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def is_endless(value: object) -> bool:
+    """NaN or infinity, which no run writes and no curve can show."""
+    return isinstance(value, float) and not math.isfinite(value)
 
 
 def _config(path: Path, missing: list[str]) -> RunConfig | None:
@@ -200,10 +223,10 @@ def _json_lines(path: Path, missing: list[str], consequence: str) -> Iterator[di
     for raw in path.read_bytes().splitlines():
         try:
             line = json.loads(raw)
-        except (UnicodeDecodeError, json.JSONDecodeError):
+        except (ValueError, RecursionError):  # also bytes that are no text, and numbers of thousands of digits
             line = None
         if isinstance(line, dict):
-            yield line
+            yield {key: None if is_endless(value) else value for key, value in line.items()}
         else:
             unreadable += 1
     if unreadable:
@@ -223,15 +246,36 @@ def _episodes(path: Path, missing: list[str]) -> tuple[TrainingEpisode, ...]:
         try:
             summary = _episode(line)
             episodes.append(
-                TrainingEpisode(summary=summary, env_steps=line["env_steps"], policy_version=line["policy_version"])
+                TrainingEpisode(
+                    summary=summary, env_steps=int(line["env_steps"]), policy_version=int(line["policy_version"])
+                )
             )
         except KeyError as error:
             missing.append(f"{path.name}: a line without {error}; its episode is left out.")
-    keep = not_superseded(np.array([e.env_steps for e in episodes], dtype=np.float64))
-    return tuple(e for e, kept in zip(episodes, keep, strict=True) if kept)
+        except (TypeError, ValueError) as error:
+            missing.append(f"{path.name}: a line that is no episode ({error}); it is left out.")
+    steps = np.array([e.env_steps for e in episodes], dtype=np.float64)
+    return tuple(episodes[i] for i in _not_repeated(steps, [e.policy_version < 0 for e in episodes]))
 
 
-def _evaluations(folder: Path, missing: list[str]) -> tuple[Evaluation, ...]:
+def _not_repeated(steps: Points, before_rl: Sequence[bool]) -> Int64[np.ndarray, " kept"]:
+    """Indices of the points that count, in the order of their steps; those before RL and of it are judged apart."""
+    early = np.array(before_rl, dtype=bool)
+    kept = np.zeros(len(steps), dtype=bool)
+    for part in (early, ~early):
+        kept[part] = not_superseded(steps[part])
+    indices = np.flatnonzero(kept)
+    return indices[np.argsort(steps[indices], kind="stable")]
+
+
+def _replaced_steps(lines: Sequence[dict[str, Any]]) -> set[float]:
+    """Steps of evaluations that a resume has gone back behind and not made again."""
+    made = [r["env_steps"] for r in lines if _is_number(r.get("eval_return")) and _is_number(r.get("env_steps"))]
+    steps = np.array(made, dtype=np.float64)
+    return set(steps) - set(steps[not_superseded(steps)])
+
+
+def _evaluations(folder: Path, missing: list[str], replaced: set[float]) -> tuple[Evaluation, ...]:
     evaluations = []
     for path in sorted(folder.glob("*.json")):
         values = _json_object(path, missing, "this evaluation is left out")
@@ -239,7 +283,8 @@ def _evaluations(folder: Path, missing: list[str]) -> tuple[Evaluation, ...]:
             evaluations.append(_evaluation(values))
         except (KeyError, TypeError, ValueError) as error:
             missing.append(f"evaluation/{path.name}: incomplete ({error}), left out.")
-    return tuple(sorted(evaluations, key=lambda e: (e.env_steps, e.name == "final")))
+    kept = [e for e in evaluations if not (e.name.startswith("step-") and e.env_steps in replaced)]
+    return tuple(sorted(kept, key=lambda e: (e.env_steps, e.name == "final")))
 
 
 def _evaluation(values: dict[str, Any]) -> Evaluation:

@@ -18,8 +18,9 @@ from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from slotfilm_dist.envs.reward_bounds import largest_terms
 from slotfilm_dist.evaluation.figure_style import LINES, STYLE, steps_axis
-from slotfilm_dist.evaluation.record import RunRecord
+from slotfilm_dist.evaluation.record import RunRecord, TrainingEpisode
 
 TABLE_TERMS = ("reach", "post_grasp", "place")
 """Components of Table 2 and Figure 9, in the paper's order."""
@@ -34,11 +35,13 @@ def window_rows(record: RunRecord) -> list[dict[str, Any]]:
     """Table 2: one row for each window and component.
 
     The windows are thirds of the steps that the run is planned for; one that holds no episode yet gives no rows.
+    Episodes of the random policy count nowhere.
 
     Raises:
         ValueError: the run has no training episodes, or no reward in components.
     """
-    steps, terms, names = _episode_terms(record)
+    episodes, terms, names = _episode_terms(record)
+    steps = np.array([e.env_steps for e in episodes])
     total = record.config.schedule.total_steps if record.config else int(steps.max())
     edges = np.linspace(0, total, len(WINDOWS) + 1)
     of_table = [names.index(name) for name in TABLE_TERMS]
@@ -67,23 +70,25 @@ def window_rows(record: RunRecord) -> list[dict[str, Any]]:
 
 
 def component_rows(record: RunRecord) -> list[dict[str, Any]]:
-    """Figure 9: one row for each episode, components divided by their weights, so that each lies in [0, 1].
+    """Figure 9: one row for each episode, components divided by their largest value, so that each lies in [0, 1].
 
-    That holds for `reward.near_form = bounded`. A component of weight 0 is left out.
+    A component of weight 0 is left out.
     """
-    steps, terms, names = _episode_terms(record)
-    lengths = np.array([e.summary.length for e in record.episodes], dtype=np.float64)
+    if record.config is None:
+        raise ValueError(f"{record.run_dir}: config.json is missing; the weights of the reward are unknown")
+    episodes, terms, names = _episode_terms(record)
+    largest = largest_terms(record.config.reward)
+    lengths = np.array([e.summary.length for e in episodes], dtype=np.float64)
     columns = {}
     for index, name in enumerate(names):
-        weight = _largest_step_reward(record, name)
-        if weight > 0:
-            columns[name] = terms[:, index] / lengths / weight
+        if largest[name] > 0:
+            columns[name] = terms[:, index] / lengths / largest[name]
     smooth = {name: moving_average(values, SMOOTHING) for name, values in columns.items()}
     return [
-        {"env_steps": int(steps[i])}
+        {"env_steps": episode.env_steps}
         | {name: values[i] for name, values in columns.items()}
         | {f"{name}_smoothed": values[i] for name, values in smooth.items()}
-        for i in range(len(steps))
+        for i, episode in enumerate(episodes)
     ]
 
 
@@ -115,9 +120,13 @@ def draw_components(rows: Sequence[dict[str, Any]], path: Path) -> Path:
     return path
 
 
-def _episode_terms(record: RunRecord) -> tuple[Float64[np.ndarray, " episodes"], Shares, list[str]]:
-    """Steps of the run at each episode's end, sums of its components, and their names."""
-    if not record.episodes:
+def _episode_terms(record: RunRecord) -> tuple[list[TrainingEpisode], Shares, list[str]]:
+    """Episodes that the learning policy played, steps at their ends, sums of their components, and those' names.
+
+    The random policy's are left out: only the run that collected its data has them, not those that share it.
+    """
+    own = [e for e in record.episodes if e.policy_version >= 0]
+    if not own:
         raise ValueError(f"{record.run_dir}: episodes.jsonl holds no training episode yet")
     names: list[str] = list(record.reward_term_names)
     if len(names) == len(_OWN_TERMS) and names[0] == "term 1":
@@ -125,8 +134,7 @@ def _episode_terms(record: RunRecord) -> tuple[Float64[np.ndarray, " episodes"],
     missing = [name for name in TABLE_TERMS if name not in names]
     if missing:
         raise ValueError(f"{record.run_dir}: its task's reward has no component {', '.join(missing)}")
-    steps = np.array([e.env_steps for e in record.episodes], dtype=np.float64)
-    return steps, np.array([e.summary.reward_terms for e in record.episodes], dtype=np.float64), names
+    return own, np.array([e.summary.reward_terms for e in own], dtype=np.float64), names
 
 
 def _shares(terms: Shares) -> Float64[np.ndarray, "earning terms"]:
@@ -134,15 +142,6 @@ def _shares(terms: Shares) -> Float64[np.ndarray, "earning terms"]:
     total = terms.sum(axis=1, keepdims=True)
     earned = total[:, 0] > 0
     return terms[earned] / total[earned]
-
-
-def _largest_step_reward(record: RunRecord, name: str) -> float:
-    """What a component adds to a step's reward at most."""
-    if record.config is None:
-        raise ValueError(f"{record.run_dir}: config.json is missing; the weights of the reward are unknown")
-    reward = record.config.reward
-    divisor = reward.weights.total if reward.normalize == "sum" else 1.0
-    return getattr(reward.weights, name) / divisor
 
 
 _OWN_TERMS: tuple[str, ...] = ("reach", "grasp", "place", "post_grasp", "static")

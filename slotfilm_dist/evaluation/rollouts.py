@@ -12,6 +12,7 @@ from slotfilm_dist.messages import EpisodeSummary, Observation, StepResult
 from slotfilm_dist.nets.encoder import SlotFusionEncoder
 from slotfilm_dist.nets.interface import Encoder
 from slotfilm_dist.policy import Policy
+from slotfilm_dist.rejection import BrokenEnvironmentError, StepCheck
 
 Watch = Callable[[Observation, np.ndarray, StepResult], None]
 """Called with what was seen, as stored, and what the action led to."""
@@ -27,14 +28,24 @@ def play_episodes(
         policy: acts; give a deterministic one for evaluation.
         seeds: of the episodes.
         watch: sees every step.
+
+    Raises:
+        BrokenEnvironmentError: a step or a first picture that is not finite or all black: no episode to judge by.
     """
+    check = StepCheck()
     for seed in seeds:
         observation = env.reset([seed])
+        if not check.accepts_start(observation):
+            raise BrokenEnvironmentError(f"the episode of seed {seed} began with what is not finite or a black picture")
         tracker = EpisodeTracker([seed], len(env.reward_term_names))
         finished: list[EpisodeSummary] = []
         while not finished:
             visual = policy.visual(observation)
             step = env.step(policy.act(observation, visual), [seed])
+            if not check.accepted(step).all():
+                raise BrokenEnvironmentError(
+                    f"a step of the episode of seed {seed} was not finite or had a black picture"
+                )
             if watch is not None:
                 watch(observation, visual, step)
             finished = tracker.add(step, [seed])

@@ -128,10 +128,13 @@ class CheckpointStore:
         self._keep = keep
 
     def write(self, checkpoint: Checkpoint, updates: int) -> int:
-        """Write one and drop the oldest ones beyond `keep`; gives its size in bytes."""
-        size = write_checkpoint(self.folder / f"updates-{updates:09d}", checkpoint)
-        for old in self._numbered()[: -self._keep]:
-            shutil.rmtree(old, ignore_errors=True)
+        """Write one, drop the oldest ones beyond `keep` and those that the run went back behind; gives its size."""
+        own = self.folder / f"updates-{updates:09d}"
+        size = write_checkpoint(own, checkpoint)
+        there = self._numbered()
+        until_now = [path for path in there if path.name <= own.name]
+        for path in (*until_now[: -self._keep], *there[len(until_now) :]):
+            shutil.rmtree(path, ignore_errors=True)
         return size
 
     def write_best(self, checkpoint: Checkpoint) -> int:

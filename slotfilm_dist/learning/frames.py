@@ -32,7 +32,7 @@ def split_by_episode(
     if len(episodes) < 2:
         raise ValueError(
             f"pre-training needs frames of at least two episodes, to hold one out, and got {len(episodes)}: "
-            "raise schedule.random_steps above env.max_steps"
+            "raise schedule.random_steps, or lower schedule.random_episode_steps or env.max_steps"
         )
     num_held_out = min(max(math.ceil(holdout * len(episodes)), 1), len(episodes) - 1)
     chosen = np.random.default_rng(seed).choice(episodes, num_held_out, replace=False)

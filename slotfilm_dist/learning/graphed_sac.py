@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from slotfilm_dist.config import RunConfig
-from slotfilm_dist.learning import losses
 from slotfilm_dist.learning.lean_adam import LeanAdam, pieces
 from slotfilm_dist.learning.off_policy import MAX_SKIPPED, METRICS_EVERY, TrainingDivergedError, gradient_norm
 from slotfilm_dist.learning.sac import ADVICE, BATCH_FIELDS, SacLearner, annealed_temperature
@@ -134,8 +133,7 @@ class GraphedSac(SacLearner):
         policy = self._policy_terms(critics.latent.detach(), noise)
         failed = self._descend_unless(failed, self._policy_optimiser, policy.loss, 0.0)
         if sac.temperature_mode == "auto":
-            loss = losses.temperature_loss(self.log_temperature, policy.log_prob, sac.target_entropy)
-            self._descend_unless(failed, self._temperature_optimiser, loss, 0.0)
+            self._descend_unless(failed, self._temperature_optimiser, self._temperature_loss(policy.log_prob), 0.0)
         self._follow_unless(failed)
         self._count(failed)
         return self._measure(batch, critics, policy) if measure else {}

@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from slotfilm_dist.config import TEMPERATURE_FIELDS, RunConfig, SacConfig, config_hash
+from slotfilm_dist.config import TEMPERATURE_FIELDS, RunConfig, SacConfig
+from slotfilm_dist.config_files import config_hash
 from slotfilm_dist.envs.reward import rewards_of
 from slotfilm_dist.learning.checkpoint import Checkpoint, plain_tensors
 from slotfilm_dist.learning.ddpg import DdpgLearner
@@ -55,7 +56,15 @@ STATE_ROWS = 200_000
 def pretrain_hash(config: RunConfig) -> str:
     """Names the pre-trained encoder: the fields that it depends on, and no others."""
     encoder = dataclasses.replace(config.encoder, fusion="film_tanh", goal=False)
-    return config_hash(config.env, config.obs.num_objects, encoder, config.pretrain, data_identity(config))
+    identity = data_identity(config) | picture_identity(config)
+    ending = (config.success,) if config.env.terminate_on_success else ()
+    return config_hash(config.env, config.obs.num_objects, encoder, config.pretrain, identity, *ending)
+
+
+def picture_identity(config: RunConfig) -> dict[str, Any]:
+    """What pictures depend on beside `env` and `success`: the target's radius where it is seen or ends episodes."""
+    matters = config.env.goal_visible or config.env.terminate_on_success
+    return {"delta_m": config.reward.delta_m} if matters else {}
 
 
 def data_identity(config: RunConfig) -> dict[str, Any]:
@@ -94,11 +103,6 @@ class Learner:
         """The RL half; exists after `begin_rl`."""
         assert self._rl is not None, "begin_rl comes first"
         return self._rl
-
-    @property
-    def needs_pretraining(self) -> bool:
-        """Whether this agent has a camera and any pre-training steps."""
-        return self.config.encoder.uses_image and self.config.pretrain.steps > 0
 
     @property
     def pretrain_steps(self) -> int:
@@ -222,12 +226,15 @@ class Learner:
         self.rl.settle()
 
     def metrics(self) -> dict[str, float]:
-        """The latest measurements of RL."""
-        return self.rl.metrics()
+        """The latest measurements of RL, and the GPU's memory."""
+        on_gpu = self.device.type == "cuda"
+        memory = {"run_gpu_memory_bytes": float(torch.cuda.memory_allocated(self.device))} if on_gpu else {}
+        return self.rl.metrics() | memory
 
     def snapshot(self) -> WeightSnapshot:
         """What workers need to act now."""
-        return WeightSnapshot(version=self.updates, published_at_s=time.time(), arrays=self.rl.acting_arrays())
+        arrays = self.rl.acting_arrays()  # first: on a GPU it finds out which updates were made
+        return WeightSnapshot(version=self.updates, published_at_s=time.time(), arrays=arrays)
 
     def checkpoint(self, values: Mapping[str, Any]) -> Checkpoint:
         """Everything that the next update depends on, with the caller's own plain values beside it."""
@@ -247,7 +254,10 @@ class Learner:
 
 
 def learning_hash(config: RunConfig) -> str:
-    """Names what a checkpoint depends on: all but budgets, places, rates and temperature, which a resume may change."""
+    """Names what a checkpoint needs to be read: all but budgets, places, rates, temperature and the reward.
+
+    A resume may change budgets, places, rates and temperature; `runs.resumed_config` refuses the rest.
+    """
     own = (config.ddpg,) if config.algorithm == "ddpg" else ()
     sac = dataclasses.replace(config.sac, **{name: getattr(SacConfig(), name) for name in TEMPERATURE_FIELDS})
     return config_hash(config.variant, config.seed, config.env, config.obs, config.encoder, sac, *own)

@@ -228,7 +228,10 @@ def _load_optimiser(optimiser: torch.optim.Optimizer, name: str, tensors: Mappin
             index, _, field = rest.partition(".")
             if not (index.isdecimal() and index.isascii() and len(index) < 9 and int(index) < len(parameters)):
                 raise ValueError(f"checkpoint: {key} is not part of this agent")
-            _check_shape(key, value, value.new_empty(()) if field == "step" else parameters[int(index)])
+            parameter = parameters[int(index)]
+            _check_shape(key, value, value.new_empty(()) if field == "step" else parameter)
+            if field != "step":  # saved as they are read, but a fused step walks weights and moments side by side
+                value = torch.empty_like(parameter, dtype=value.dtype, device=value.device).copy_(value)
             state.setdefault(int(index), {})[field] = value
     fields = {field for moments in state.values() for field in moments}
     for index, moments in state.items():

@@ -1,7 +1,8 @@
 """The three losses of slot pre-training (Section 4.3).
 
-All are masked by visibility and divided by the number of visible objects in the batch, so that frames in which little
-is to be seen do not count for less per object. Objects out of view may carry any position, also one that is not finite.
+Position and attention are masked by visibility and divided by the number of visible objects in the batch, so that
+frames in which little is to be seen do not count for less per object; visibility itself is judged for every object.
+Objects out of view may carry any position, also one that is not finite.
 """
 
 import functools

@@ -14,12 +14,14 @@ from slotfilm_dist.learning.frames import PretrainFrames, mean_position, split_b
 from slotfilm_dist.learning.perception_losses import pretrain_losses
 from slotfilm_dist.learning.perception_quality import PerceptionQuality, perception_quality
 from slotfilm_dist.learning.rows import Rows
+from slotfilm_dist.machine import takes_bfloat16
 from slotfilm_dist.nets.backbone import FEATURE_CHANNELS
 from slotfilm_dist.nets.capture import Capture, Feed
 from slotfilm_dist.nets.encoder import SlotFusionEncoder
 from slotfilm_dist.nets.perception import Perception
 
 _FORWARD_BATCH = 128
+_PERCEPTION = "perception."
 _ADAM_MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
@@ -69,7 +71,7 @@ class Pretrainer:
         self.num_steps = 0
         """Gradient steps done."""
         self._image_size = self.network.image_size
-        self._half = config.precision == "bfloat16"
+        self._half = _takes_bfloat16(config.precision, self.device)
         if frames.rgb.shape[1:3] != (self._image_size, self._image_size):
             raise ValueError(f"env.image_size = {self._image_size}: the frames are {frames.rgb.shape[1:3]} pixels")
         self._seed = seed
@@ -168,13 +170,16 @@ class Pretrainer:
         self.encoder.eval()
 
     def save(self) -> dict[str, Any]:
-        """Weights, Adam's moments and the step, as nested dicts of arrays and scalars."""
+        """The perception's weights, Adam's moments and the step, as nested dicts of arrays and scalars.
+
+        Fusion and gate are left out, so that an agent with others can take it over and go on with it.
+        """
         moments = {
             name: {key: _array(self._optimizer.state[parameter][key]) for key in _ADAM_MOMENTS}
             for name, parameter in self._trained.items()
             if parameter in self._optimizer.state
         }
-        weights = {name: _array(value) for name, value in self.encoder.state_dict().items()}
+        weights = {_PERCEPTION + name: _array(value) for name, value in self.network.state_dict().items()}
         return {"num_steps": self.num_steps, "seed": self._seed, "weights": weights, "adam": moments}
 
     def load(self, state: Mapping[str, Any]) -> None:
@@ -189,9 +194,13 @@ class Pretrainer:
             raise ValueError(
                 "pretrain.train_backbone: the saved pre-training trained other parameters; resume with its"
             )
-        weights = {name: torch.from_numpy(np.array(value)) for name, value in state["weights"].items()}
+        weights = {
+            name.removeprefix(_PERCEPTION): torch.from_numpy(np.array(value))
+            for name, value in state["weights"].items()
+            if name.startswith(_PERCEPTION)
+        }
         try:
-            self.encoder.load_state_dict(weights)
+            self.network.load_state_dict(weights)
         except RuntimeError as error:
             raise ValueError(f"the saved pre-training belongs to another encoder: {error}") from None
         self.num_steps = int(state["num_steps"])
@@ -222,12 +231,11 @@ class Pretrainer:
     def _perceive(self, seen: Shaped[Tensor, "batch ..."], *, training: bool) -> Perception:
         """The network's view of frames as `_seen` gives them; BatchNorm of a trained backbone follows `training`."""
         rows = self._all_rows().on_device(seen)
+        if self.config.train_backbone == "none":
+            return self.network(self.network.projection(rows.float()))
+        self.encoder.train(training)
         with torch.autocast(self.device.type, torch.bfloat16, self._half, cache_enabled=False):
-            if self.config.train_backbone == "all":
-                self.encoder.train(training)
-                tokens = self.network.tokens(rows)
-            else:
-                tokens = self.network.projection(rows.float())
+            tokens = self.network.tokens(rows)
         return self.network(tokens.float())
 
     def _batch(self, chosen: Int[np.ndarray, " batch"]) -> dict[str, np.ndarray]:
@@ -257,6 +265,12 @@ class Pretrainer:
             pictures = torch.from_numpy(np.asarray(rgb[chosen])).to(self.device)
             features[chosen] = self.network.frozen_features(pictures).half().cpu().numpy()
         return features
+
+
+def _takes_bfloat16(precision: str, device: torch.device) -> bool:
+    if device.type == "cuda" and precision == "auto":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return takes_bfloat16(precision)
 
 
 def _batches(chosen: Int[np.ndarray, " frames"]) -> list[Int[np.ndarray, " batch"]]:

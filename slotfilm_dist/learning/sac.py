@@ -191,7 +191,11 @@ class SacLearner(OffPolicyLearner[Actor]):
 
     def _measure(self, batch: Mapping[str, Tensor], critics: CriticTerms, policy: PolicyTerms) -> dict[str, Tensor]:
         """The metrics of an update."""
+        tuned = {}
+        if self.config.sac.temperature_mode == "auto":
+            tuned["learner_temperature_loss"] = self._temperature_loss(policy.log_prob).detach()
         return {
+            **tuned,
             **self._gradient_norms(),
             **self.encoder.diagnostics(batch["proprio"]),
             "learner_critic_loss": critics.loss.detach(),
@@ -208,11 +212,14 @@ class SacLearner(OffPolicyLearner[Actor]):
 
     def _step_temperature(self, log_prob: Float[Tensor, " batch"]) -> None:
         self._temperature_optimiser.zero_grad(set_to_none=True)
-        losses.temperature_loss(self.log_temperature, log_prob, self.config.sac.target_entropy).backward()
+        self._temperature_loss(log_prob).backward()
         self._temperature_optimiser.step()
 
+    def _temperature_loss(self, log_prob: Float[Tensor, " batch"]) -> Float[Tensor, ""]:
+        return losses.temperature_loss(self.log_temperature, log_prob, self.config.sac.target_entropy)
+
     def _gradient_norms(self) -> dict[str, Tensor]:
-        """Of the step just taken, before clipping."""
+        """Of the step just taken, as clipping left them."""
         norms = {
             "learner_critic_gradient_norm": self.critic.parameters(),
             "learner_encoder_gradient_norm": self.encoder.fusion_parameters(),

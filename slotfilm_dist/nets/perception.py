@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from slotfilm_dist.config import EncoderConfig
-from slotfilm_dist.machine import has_bfloat16
+from slotfilm_dist.machine import takes_bfloat16
 from slotfilm_dist.nets.attention import FoldedSlotAttention
 from slotfilm_dist.nets.backbone import FEATURE_CHANNELS, STRIDE, Backbone
 from slotfilm_dist.nets.initialization import seeded_head, seeded_linear, seeded_normal
@@ -41,7 +41,7 @@ class PerceptionNetwork(nn.Module):
         self.pos_scale, self.matched_visibility = config.pos_scale, config.vis_head == "matched"
         self.frozen = False
         """Backbone and projection never change again, and BatchNorm stays in eval mode."""
-        self._half = config.frozen_precision == "bfloat16" or (config.frozen_precision == "auto" and has_bfloat16())
+        self._half = takes_bfloat16(config.frozen_precision)
         self.backbone = Backbone(generator)
         self.projection = seeded_linear(FEATURE_CHANNELS, dim, generator)
         self.row_code = seeded_normal(self.grid_size, dim // 2, generator=generator)

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt8
 
 from slotfilm_dist.atomic import FileDigest, check_file
-from slotfilm_dist.config import check, from_dict
+from slotfilm_dist.config import check
+from slotfilm_dist.config_files import from_dict
 from slotfilm_dist.messages import TransitionBlock
 from slotfilm_dist.replay.schema import Column, ReplaySchema
 

@@ -11,7 +11,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from slotfilm_dist.atomic import file_digest, write_atomic
-from slotfilm_dist.config import check, to_dict
+from slotfilm_dist.config import check
+from slotfilm_dist.config_files import to_dict
 from slotfilm_dist.messages import TransitionBlock
 from slotfilm_dist.replay.dataset import FORMAT, HEADER_BYTES, MANIFEST, PROGRESS, dataset_columns, npy_header
 from slotfilm_dist.replay.schema import Column, ReplaySchema

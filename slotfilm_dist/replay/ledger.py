@@ -92,6 +92,10 @@ class BlockLedger:
         log = self._logs.get(worker_id, {}).get(incarnation)
         return log is not None and log.has(sequence // self.num_shards)
 
+    def newest_incarnation(self, worker_id: int) -> int:
+        """The newest incarnation of a worker that is known, -1 if none is."""
+        return max((*self._logs.get(worker_id, ()), self._newest_forgotten.get(worker_id, -1)))
+
     def record(self, worker_id: int, incarnation: int, sequence: int) -> None:
         """Note that a block, which `has` denied, is stored now."""
         logs = self._logs.setdefault(worker_id, {})

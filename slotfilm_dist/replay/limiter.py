@@ -256,8 +256,6 @@ class RateLimiter:
         check(num_updates > 0, "num_updates", num_updates, "must be greater than 0")
         if not self._learning:  # nothing is held back yet, so nothing can wait for ever
             return
-        if not self._learning:
-            return  # nothing is held back yet, so nothing can wait
         insert, update = max(self._largest_insert, num_steps), max(self._largest_update, num_updates)
         # Both sides can wait at once only if one request of each is larger than the two slacks together.
         needed = math.ceil(insert + (update - self._slack_updates) / self._ratio)

@@ -5,15 +5,17 @@ import json
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from slotfilm_dist.config import changed_fields, check, from_dict, to_dict
+from slotfilm_dist.config import RunConfig, check
+from slotfilm_dist.config_files import changed_fields, from_dict, to_dict
 from slotfilm_dist.messages import SampleBatch, TransitionBlock
 from slotfilm_dist.replay.ledger import BlockLedger
 from slotfilm_dist.replay.ring import RowRing, SampleTotals, whole_number
 from slotfilm_dist.replay.schema import ReplaySchema
+from slotfilm_dist.seeds import Role, role_seed
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -88,6 +90,14 @@ class ReplayShard:
         self._inserted_steps += block.num_steps
         self._inserted_blocks += 1
         return True
+
+    def knows(self, worker_id: int, incarnation: int, sequence: int) -> bool:
+        """Whether that block counts as stored before; raises ``ValueError`` if it is another shard's."""
+        return self._ledger.has(worker_id, incarnation, sequence)
+
+    def newest_incarnation(self, worker_id: int) -> int:
+        """The newest incarnation of a worker of which a block was ever stored here; -1 if there is none."""
+        return self._ledger.newest_incarnation(worker_id)
 
     def sample(self, num_batches: int, batch_size: int) -> list[SampleBatch]:
         """Draw batches with replacement, uniformly over all stored steps.
@@ -174,6 +184,24 @@ class ReplayShard:
         self._ledger = ledger
         self._rng = rng
         self._inserted_steps, self._inserted_blocks, self._duplicate_blocks = totals
+
+
+ShardT = TypeVar("ShardT", bound=ReplayShard)
+
+
+def build_shard(kind: type[ShardT], config: RunConfig, schema: ReplaySchema, index: int) -> ShardT:
+    """Shard `index` of a run, empty."""
+    count = config.replay.num_shards
+    return kind(
+        schema,
+        -(-config.replay.capacity // count),
+        role_seed(config.seed, Role.REPLAY, index + 1),
+        index=index,
+        num_shards=count,
+        block_steps=config.runtime.block_steps,
+        n_step=config.n_step,
+        gamma=config.sac.gamma,
+    )
 
 
 def generator_from(state: Any) -> np.random.Generator:

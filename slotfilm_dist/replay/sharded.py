@@ -76,6 +76,14 @@ class ShardedReplay:
         """Store a block in its shard; False if it had been stored before."""
         return self._shards[shard_of(block.worker_id, block.sequence, len(self._shards))].insert(block)
 
+    def knows(self, worker_id: int, incarnation: int, sequence: int) -> bool:
+        """Whether that block counts as stored before."""
+        return self._shards[shard_of(worker_id, sequence, len(self._shards))].knows(worker_id, incarnation, sequence)
+
+    def newest_incarnation(self, worker_id: int) -> int:
+        """The newest incarnation of a worker of which a block was ever stored; -1 if there is none."""
+        return max(shard.newest_incarnation(worker_id) for shard in self._shards)
+
     def sample(self, num_batches: int, batch_size: int) -> list[SampleBatch]:
         """Draw batches with replacement, uniformly over the steps of all shards.
 

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from slotfilm_dist.atomic import TEMPORARY_SUFFIX, FileDigest, check_file, write_atomic
-from slotfilm_dist.config import check, to_dict
+from slotfilm_dist.config import check
+from slotfilm_dist.config_files import to_dict
 from slotfilm_dist.replay.codec import DTYPES, decode, encode
 from slotfilm_dist.replay.frozen import FrozenColumn
 from slotfilm_dist.replay.schema import Column

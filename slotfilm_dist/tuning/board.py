@@ -87,7 +87,7 @@ class Board:
 
     def say(self, text: str) -> None:
         """A sentence that stays."""
-        self._console.print(text, soft_wrap=True)
+        self._console.print(text, soft_wrap=True, markup=False)
 
     def refresh(self) -> None:
         """Show the present state, if it is time."""

@@ -65,7 +65,8 @@ def estimate(job: Job, resources: TrialResources) -> JobEstimate:
     kept = _kept_bytes(job)
     config = job.config
     replay = replay_bytes(config, min(config.replay.capacity, config.schedule.total_steps))
-    snapshot = replay if job.kind == "trial" and config.checkpoint.save_replay else 0
+    # The one before stays until the next is whole.
+    snapshot = 2 * replay if job.kind == "trial" and config.checkpoint.save_replay else 0
     return JobEstimate(hours=seconds / 3600, disk_bytes=kept + snapshot, kept_bytes=kept)
 
 

@@ -1,12 +1,14 @@
 """What a grid's directory says of itself: the settings that all its trials share, and the command that began it."""
 
 import json
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from slotfilm_dist.atomic import write_atomic
-from slotfilm_dist.config import RunConfig, changed_fields, from_dict, to_dict
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config_files import changed_fields, from_dict, to_dict
 
 GRID_FILE = "grid.json"
 
@@ -21,14 +23,17 @@ def check_same_settings(grid: Path, settings: RunConfig) -> None:
     values = _read(grid)
     if not values:
         return
-    differing = changed_fields(from_dict(RunConfig, values["settings"]), settings)
+    try:
+        differing = changed_fields(from_dict(RunConfig, values["settings"]), settings)
+    except ValueError as error:
+        raise ValueError(f"{grid / GRID_FILE}: {error}; give this grid another --name") from None
     if differing:
         raise ValueError(f"{grid} is a grid with other settings ({', '.join(differing)}); give this one another --name")
 
 
 def write_grid_file(grid: Path, settings: RunConfig, command: Sequence[str]) -> None:
     """Note the settings, and the command of this start beside those before."""
-    commands = [*_read(grid).get("commands", []), " ".join(("slotfilm", *command))]
+    commands = [*_read(grid).get("commands", []), shlex.join(("slotfilm", *command))]
     values = {"settings": to_dict(settings), "commands": list(dict.fromkeys(commands))}
     write_atomic(grid / GRID_FILE, [json.dumps(values, indent=1).encode()])
 
@@ -43,6 +48,6 @@ def _read(grid: Path) -> dict[str, Any]:
         raise ValueError(
             f"{path} is not valid JSON ({error}); delete it if the grid's settings have not changed"
         ) from None
-    if not isinstance(values, dict) or "settings" not in values:
+    if not isinstance(values, dict) or not isinstance(values.get("settings"), dict):
         raise ValueError(f"{path} is not a grid's; give this grid another --name")
     return values

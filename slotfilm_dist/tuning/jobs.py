@@ -6,13 +6,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from slotfilm_dist.config import CheckpointConfig, RunConfig, RuntimeConfig, config_hash
+from slotfilm_dist.config import CheckpointConfig, RunConfig, RuntimeConfig
+from slotfilm_dist.config_files import config_hash
+from slotfilm_dist.envs.tasks import check_goal
 from slotfilm_dist.learning.learner import dataset_hash, pretrain_hash
 from slotfilm_dist.replay.dataset import MANIFEST
 from slotfilm_dist.variants import SECTIONS, VARIANTS, apply_variant
 
 JobKind = Literal["data", "encoder", "trial"]
 """The random policy's data, a pre-trained encoder, or a whole run of one variant and seed."""
+MAX_SEEDS = 10_000
+"""More are a slip of the finger, and take minutes only to be listed."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -71,12 +75,12 @@ def build_trials(base: RunConfig, variants: Iterable[str], num_seeds: int) -> li
     """
     if num_seeds < 1:
         raise ValueError(f"--seeds {num_seeds}: must be 1 or more")
-    names = list(variants)
-    return [
-        replace(apply_variant(name, base), seed=seed)
-        for seed in range(base.seed, base.seed + num_seeds)
-        for name in names
-    ]
+    if num_seeds > MAX_SEEDS:
+        raise ValueError(f"--seeds {num_seeds}: must be {MAX_SEEDS} or fewer")
+    configs = [apply_variant(name, base) for name in variants]
+    for config in configs:
+        check_goal(config)
+    return [replace(config, seed=seed) for seed in range(base.seed, base.seed + num_seeds) for config in configs]
 
 
 def build_jobs(trials: Sequence[RunConfig]) -> list[Job]:
@@ -87,7 +91,7 @@ def build_jobs(trials: Sequence[RunConfig]) -> list[Job]:
         data = Job(key=f"random-{dataset_hash(config)}", kind="data", config=config)
         shared.setdefault(data.key, data)
         needs = [data.key]
-        if config.encoder.uses_image and config.pretrain.steps > 0:
+        if config.pretrains:
             key = f"encoder-{pretrain_hash(config)}"
             shared.setdefault(key, Job(key=key, kind="encoder", config=config, needs=(data.key,)))
             needs.append(key)

@@ -25,6 +25,13 @@ OVER: tuple[JobState, ...] = ("done", "pruned")
 """States of a trial that is never run again."""
 LEDGER = "ledger"
 """Folder of the records in a grid's directory."""
+MAKING = "making"
+"""Folder in it of the jobs that make data and encoders for its trials."""
+
+
+def directory_of(grid: Path, key: str, kind: str) -> Path:
+    """Where the run of a grid's job lives."""
+    return grid / key if kind == "trial" else grid / MAKING / key
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -8,7 +8,7 @@ from ray.tune.experiment import Trial
 from ray.tune.schedulers import AsyncHyperBandScheduler, FIFOScheduler, TrialScheduler
 from ray.tune.search import Searcher
 
-from slotfilm_dist.config import config_hash
+from slotfilm_dist.config_files import config_hash
 from slotfilm_dist.tuning.jobs import Job
 from slotfilm_dist.tuning.work import Orders, Work
 

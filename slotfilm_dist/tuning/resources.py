@@ -9,7 +9,6 @@ from slotfilm_dist.cluster.placement import (
     STATE_RESOURCE,
     TOKEN,
     WORKER_RESOURCE,
-    infers_centrally,
     nodes_for,
     num_roles_that_fit,
 )
@@ -34,7 +33,7 @@ class TrialResources:
     """What one trial is given for itself."""
 
     num_roles: int
-    """Processes that share the cores: workers, learner, an evaluation player, central inference; 1 in one process."""
+    """Processes that share the cores: workers, who act by themselves, learner, evaluation player; 1 in one process."""
     role_cpus: float
     """Cores of each; below 1, roles or trials share a core."""
     num_gpus: float
@@ -90,7 +89,8 @@ def job_resources(
         nodes: the cluster.
         cpus_per_trial: cores, divided evenly among the roles; None gives each role a core, or the largest share with
             which one trial fits.
-        gpus_per_trial: GPUs of the learner; None gives it one where there is one.
+        gpus_per_trial: GPUs of the learner, also where a node with a GPU has yet to join; None gives it one where
+            there is one.
 
     Raises:
         ValueError: a number that cannot be asked for.
@@ -103,8 +103,7 @@ def job_resources(
     config = job.config
     on_ray = config.runtime.mode == "ray"
     num_gpus = _gpus(config, nodes, gpus_per_trial)
-    central = infers_centrally(config, gpu=num_gpus > 0)
-    num_roles = config.runtime.num_workers + OTHER_ROLES + central if on_ray else 1
+    num_roles = config.runtime.num_workers + OTHER_ROLES if on_ray else 1
     state_nodes, worker_nodes = nodes_for(nodes, STATE_RESOURCE), nodes_for(nodes, WORKER_RESOURCE)
     needs = ((nodes, num_roles), (state_nodes, 1), (worker_nodes, num_roles - 1))
     if cpus_per_trial is not None:
@@ -117,8 +116,8 @@ def job_resources(
         num_roles=num_roles,
         role_cpus=role_cpus,
         num_gpus=num_gpus,
-        # Hub, learner, central inference and shards take a token each.
-        state_token=TOKEN * (3 + config.replay.num_shards) if _offered(STATE_RESOURCE, nodes) else 0.0,
+        # Hub, learner and shards take a token each.
+        state_token=TOKEN * (2 + config.replay.num_shards) if _offered(STATE_RESOURCE, nodes) else 0.0,
         worker_token=TOKEN * config.runtime.num_workers if on_ray and _offered(WORKER_RESOURCE, nodes) else 0.0,
         memory_bytes=_stored_bytes(job) + (num_roles * ROLE_BYTES if on_ray else LOCAL_BYTES),
     )
@@ -182,7 +181,9 @@ def _offered(resource: str, nodes: Nodes) -> bool:
 
 
 def _gpus(config: RunConfig, nodes: Nodes, gpus_per_trial: float | None) -> float:
-    there = any(node.get("GPU", 0.0) > 0 for node in nodes)
-    if config.runtime.device == "cpu" or not (there or config.runtime.device == "cuda"):
+    if config.runtime.device == "cpu":
         return 0.0
-    return 1.0 if gpus_per_trial is None else gpus_per_trial
+    if gpus_per_trial is not None:
+        return gpus_per_trial
+    there = any(node.get("GPU", 0.0) > 0 for node in nodes)
+    return 1.0 if there or config.runtime.device == "cuda" else 0.0

@@ -20,7 +20,7 @@ from slotfilm_dist.progress import Phase, Progress
 from slotfilm_dist.runs import RunDirectory
 from slotfilm_dist.stopping import Interrupted, StopFlag
 from slotfilm_dist.tuning.jobs import Job
-from slotfilm_dist.tuning.ledger import Ledger
+from slotfilm_dist.tuning.ledger import Ledger, directory_of
 from slotfilm_dist.tuning.places import MakeBackend
 from slotfilm_dist.tuning.resources import TrialResources
 
@@ -28,8 +28,6 @@ STOP_FILE = "stop"
 """In a grid's directory: its driver wants all jobs to write their checkpoints and end."""
 LOOK_S = 0.5
 """Seconds between two looks for the stop file."""
-MAKING = "making"
-"""Folder of the runs that made shared artifacts, in a grid's directory."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -49,7 +47,7 @@ class Orders:
 
     def directory(self, job: Job) -> Path:
         """Where a job's run lives."""
-        return self.grid / job.key if job.kind == "trial" else self.grid / MAKING / job.key
+        return directory_of(self.grid, job.key, job.kind)
 
 
 class StopFile(StopFlag):
@@ -200,7 +198,7 @@ def one_line(error: BaseException) -> str:
 
 
 def _result(run: Path) -> dict[str, Any]:
-    final = read_run(run).evaluation("final")
+    final = read_run(run).final
     if final is None:
         return {}
     return {

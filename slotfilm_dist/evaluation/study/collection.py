@@ -4,11 +4,13 @@ Runs are pooled only where they differ by their variants and seeds alone. Places
 evaluation episodes may differ; everything else that does sets a run apart, and the report says so.
 """
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from slotfilm_dist.config import CheckpointConfig, EvaluationConfig, RunConfig, RuntimeConfig, changed_fields
+from slotfilm_dist.config import CheckpointConfig, EvaluationConfig, RunConfig, RuntimeConfig
+from slotfilm_dist.config_files import changed_fields
 from slotfilm_dist.evaluation.record import RunRecord, read_run
 from slotfilm_dist.variants import VARIANTS, apply_variant
 
@@ -46,8 +48,7 @@ class StudyRun:
     @property
     def is_over(self) -> bool:
         """Whether it has trained as long as it was planned and been evaluated."""
-        final = self.record.evaluation("final")
-        return final is not None and final.env_steps >= self.config.schedule.total_steps
+        return self.record.final is not None
 
     @property
     def command(self) -> str:
@@ -59,13 +60,24 @@ class StudyRun:
 class Trial:
     """A job of a grid as its ledger has it."""
 
-    key: str
-    """Name of its directory."""
+    path: Path
+    """Its directory."""
     kind: str
     variant: str
     seed: int
     state: str
     error: str = ""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Grid:
+    """What a grid's directory says of itself."""
+
+    path: Path
+    trials: tuple[Trial, ...]
+    """Its ledger."""
+    commands: tuple[str, ...]
+    """What it was started with, oldest first."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -78,11 +90,11 @@ class Study:
     unfinished: tuple[StudyRun, ...]
     """Comparable but not over: drawn as curves, in no number."""
     makers: tuple[RunRecord, ...]
-    """Directories of a grid's jobs that made data and encoders for its trials."""
+    """Directories of grids' jobs that made data and encoders for their trials."""
     left_out: tuple[str, ...]
     """One sentence for each run that is in neither, and for each trial of a grid that has no run."""
-    commands: tuple[str, ...]
-    """What made the study: the grid's commands."""
+    grids: tuple[Grid, ...]
+    """Those that the folder is or holds."""
 
     @property
     def variants(self) -> tuple[str, ...]:
@@ -92,6 +104,19 @@ class Study:
     def of(self, variant: str) -> tuple[StudyRun, ...]:
         """The runs of a variant that are over, by seed."""
         return tuple(run for run in self.runs if run.variant == variant)
+
+    def grid_of(self, record: RunRecord) -> Grid | None:
+        """The grid that a run or another job belongs to, if any."""
+        return next((grid for grid in self.grids if grid.path in record.run_dir.parents), None)
+
+    def commands_of(self, records: Iterable[RunRecord]) -> tuple[str, ...]:
+        """What made these: the commands of their grids, or their own."""
+        found: dict[str, None] = {}
+        for record in records:
+            grid = self.grid_of(record)
+            own = str(record.versions.get("command", ""))
+            found |= dict.fromkeys(grid.commands if grid and grid.commands else (own,))
+        return tuple(command for command in found if command)
 
     @property
     def reference(self) -> StudyRun:
@@ -105,89 +130,92 @@ def is_run(folder: Path) -> bool:
     return (folder / "config.json").is_file()
 
 
-def collect_study(folder: Path, trials: Sequence[Trial] = (), commands: Sequence[str] = ()) -> Study:
+def folders_of_runs(folder: Path, depth: int = DEPTH) -> Iterator[Path]:
+    """The folder and those below it in which runs are looked for, each of which may be a grid's."""
+    yield folder
+    for path in _subfolders(folder) if depth > 1 else ():
+        if not is_run(path):
+            yield from folders_of_runs(path, depth - 1)
+
+
+def collect_study(folder: Path, grids: Sequence[Grid] = ()) -> Study:
     """Read every run below a folder and sort out which of them make a study.
 
     Args:
-        folder: a folder of runs, or a grid's.
-        trials: the grid's ledger.
-        commands: the grid's commands.
+        folder: a folder of runs or of grids, or a grid's.
+        grids: those of its `folders_of_runs` that are grids.
 
     Raises:
         ValueError: no such folder, or no run in it that has trained.
     """
     if not folder.is_dir():
         raise ValueError(f"{folder} is no directory: give a run, a folder of runs, or a grid")
-    kinds = {trial.key: trial for trial in trials}
+    kinds = {trial.path: trial.kind for grid in grids for trial in grid.trials}
     runs: list[StudyRun] = []
-    makers: list[RunRecord] = []
+    makers: list[StudyRun] = []
     left_out: list[str] = []
-    for path in _run_directories(folder, DEPTH):
+    for path in sorted(path for place in folders_of_runs(folder) for path in _subfolders(place) if is_run(path)):
         record = read_run(path)
-        trial = kinds.get(path.name)
         if record.config is None:
             left_out.append(f"{_name(path, folder)}: its config.json cannot be read. {record.missing[0]}")
-        elif trial is not None and trial.kind != "trial":
-            makers.append(record)
+        elif kinds.get(path, "trial") != "trial":
+            makers.append(StudyRun(record=record, config=record.config))
         elif not record.episodes:
             left_out.append(f"{_name(path, folder)}: no training episode yet.")
         else:
             runs.append(StudyRun(record=record, config=record.config))
     if not runs:
         raise ValueError(f"{folder} holds no run that has trained; `slotfilm train` or `slotfilm grid` makes some")
-    same, others = _comparable(runs)
-    left_out += [f"{_name(run.path, folder)}: {why}" for run, why in others]
-    over, repeated = _one_a_seed([run for run in same if run.is_over])
-    left_out += [f"{_name(run.path, folder)}: {run.variant} with seed {run.seed} is there twice." for run in repeated]
-    here = {(run.variant, run.seed) for run in over}
-    cut, repeated = _one_a_seed([r for r in same if not r.is_over and (r.variant, r.seed) not in here])
+    chosen = _shared_settings(runs)
+    alien = {run.path: names for run in (*runs, *makers) if (names := _differing(chosen, _settings(run.config)))}
+    left_out += [f"{_name(path, folder)}: {_other_settings(names)}" for path, names in alien.items()]
+    same = [run for run in runs if run.path not in alien]
+    kept = _one_a_seed(same)
+    for run in same:
+        if (other := kept[run.variant, run.seed]) is not run:
+            place = _name(other.path, folder)
+            left_out.append(
+                f"{_name(run.path, folder)}: {run.variant} with seed {run.seed} is there twice; {place} counts."
+            )
     return Study(
         folder=folder,
-        runs=tuple(over),
-        unfinished=tuple(cut),
-        makers=tuple(makers),
-        left_out=(*left_out, *_absent(trials, {run.path.name for run in runs})),
-        commands=tuple(commands),
+        runs=tuple(run for run in kept.values() if run.is_over),
+        unfinished=tuple(run for run in kept.values() if not run.is_over),
+        makers=tuple(maker.record for maker in makers if maker.path not in alien),
+        left_out=(*left_out, *_absent(folder, grids)),
+        grids=tuple(grids),
     )
 
 
-def _run_directories(folder: Path, depth: int) -> Iterator[Path]:
-    for path in sorted(entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith(".")):
-        if is_run(path):
-            yield path
-        elif depth > 1:
-            yield from _run_directories(path, depth - 1)
+def _subfolders(folder: Path) -> list[Path]:
+    return sorted(entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
 
 
 def _name(path: Path, folder: Path) -> str:
     return str(path.relative_to(folder))
 
 
-def _absent(trials: Sequence[Trial], present: set[str]) -> Iterator[str]:
-    for trial in trials:
+def _absent(folder: Path, grids: Sequence[Grid]) -> Iterator[str]:
+    for trial in (trial for grid in grids for trial in grid.trials):
         if trial.state in ("failed", "pruned"):
-            yield f"{trial.key}: {trial.state}" + (f", {trial.error}" if trial.error else "") + "."
-        elif trial.kind == "trial" and trial.key not in present:
-            yield f"{trial.key}: {trial.state}, not begun."
+            yield f"{_name(trial.path, folder)}: {trial.state}" + (f", {trial.error}" if trial.error else "") + "."
+        elif trial.kind == "trial" and not is_run(trial.path):
+            yield f"{_name(trial.path, folder)}: {trial.state}, not begun."
 
 
-def _comparable(runs: Sequence[StudyRun]) -> tuple[list[StudyRun], list[tuple[StudyRun, str]]]:
-    """The largest set of runs with the same settings but for their variants, and why the others are not in it."""
-    settings = [_settings(run.config) for run in runs]
-    kinds = list(dict.fromkeys(settings))
-    alien = {a: {b: _differing(a, b) for b in kinds} for a in kinds}
+def _shared_settings(runs: Sequence[StudyRun]) -> RunConfig:
+    """The settings that most runs have, but for what their variants change."""
+    counts = Counter(_settings(run.config) for run in runs)
 
     def followers(kind: RunConfig) -> int:
-        return sum(not alien[kind][other] for other in settings)
+        return sum(count for other, count in counts.items() if not _differing(kind, other))
 
-    chosen = max(kinds, key=lambda kind: (followers(kind), kind.variant == "slotfilm"))
-    same = [run for run, kind in zip(runs, settings, strict=True) if not alien[chosen][kind]]
-    others = []
-    for run, kind in zip(runs, settings, strict=True):
-        if fields := alien[chosen][kind]:
-            shown = ", ".join(fields[:4]) + (f" and {len(fields) - 4} more" if len(fields) > 4 else "")
-            others.append((run, f"other settings than the rest ({shown}); report it from a folder of its own."))
-    return same, others
+    return max(counts, key=lambda kind: (followers(kind), kind.variant == "slotfilm"))
+
+
+def _other_settings(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    return f"other settings than the rest ({shown}); report it from a folder of its own."
 
 
 def _settings(config: RunConfig) -> RunConfig:
@@ -224,14 +252,12 @@ def _touched(config: RunConfig) -> set[str]:
     return {name for base in bases for name in changed_fields(base, vary(base))}
 
 
-def _one_a_seed(runs: Sequence[StudyRun]) -> tuple[list[StudyRun], list[StudyRun]]:
-    """The furthest run of each variant and seed, in order, and the others."""
+def _one_a_seed(runs: Sequence[StudyRun]) -> dict[tuple[str, int], StudyRun]:
+    """One run for each variant and seed, in their order: one that is over before one that is not, then the furthest."""
     order = {name: place for place, name in enumerate(VARIANTS)}
     best: dict[tuple[str, int], StudyRun] = {}
     for run in runs:
-        key = (run.variant, run.seed)
-        if key not in best or run.env_steps > best[key].env_steps:
-            best[key] = run
-    kept = sorted(best.values(), key=lambda run: (order.get(run.variant, len(order)), run.variant, run.seed))
-    chosen = {run.path for run in kept}
-    return kept, [run for run in runs if run.path not in chosen]
+        other = best.setdefault((run.variant, run.seed), run)
+        if (run.is_over, run.env_steps) > (other.is_over, other.env_steps):
+            best[run.variant, run.seed] = run
+    return dict(sorted(best.items(), key=lambda item: (order.get(item[0][0], len(order)), *item[0])))

@@ -1,14 +1,15 @@
 """A report while it is being put together: the study, its numbers, and where pictures and tables go."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from slotfilm_dist.evaluation import page_parts as html
+from slotfilm_dist.evaluation.record import RunRecord
 from slotfilm_dist.evaluation.study.blocks import Commands
-from slotfilm_dist.evaluation.study.collection import Study, StudyRun
+from slotfilm_dist.evaluation.study.collection import Study
 from slotfilm_dist.evaluation.study.estimates import Estimate
 from slotfilm_dist.evaluation.study.numbers import VariantNumbers
 
@@ -37,9 +38,9 @@ class Draft:
         by_name = {n.variant: n for n in self.numbers}
         return [by_name[name] for name in variants if name in by_name]
 
-    def made_by(self, runs: Sequence[StudyRun]) -> Commands:
-        """What made these runs: their grid, or each run's own command."""
-        commands = self.study.commands or tuple(dict.fromkeys(run.command for run in runs if run.command))
+    def made_by(self, records: Iterable[RunRecord]) -> Commands:
+        """What made these runs and jobs: their grids, or each one's own command."""
+        commands = self.study.commands_of(records)
         return Commands(text="Made by", commands=commands or ("the runs' versions.json name no command",))
 
 

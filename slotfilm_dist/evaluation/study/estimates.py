@@ -90,17 +90,6 @@ def estimate_iqm(scores: Sequence[float]) -> Estimate:
     return Estimate(value=float(iqm(values)), interval=interval, num_seeds=len(values))
 
 
-def estimate_pooled_iqm(strata: Sequence[Sequence[float]]) -> Estimate:
-    """Interquartile mean over all seeds of several variants, resampled within each variant."""
-    values = [np.array(stratum, dtype=np.float64) for stratum in strata]
-
-    def pooled(drawn: Drawn) -> Float64[np.ndarray, " *resamples"]:
-        return iqm(np.concatenate(drawn, axis=-1))
-
-    interval = stratified_bootstrap(values, pooled, np.random.default_rng(SEED_OF_RESAMPLES))
-    return Estimate(value=float(pooled(values)), interval=interval, num_seeds=sum(map(len, values)))
-
-
 def estimate_improvement(ours: Sequence[float], theirs: Sequence[float]) -> Estimate:
     """Probability that a seed of ours beats one of theirs, with its interval over both variants' seeds."""
     strata = [np.array(ours, dtype=np.float64), np.array(theirs, dtype=np.float64)]
@@ -118,10 +107,11 @@ def area_under_curve(
     """Mean height of a curve of episodes between two steps: its area divided by the steps between.
 
     An episode's value holds from the episode before it, or from `start`, up to its own end, so that episodes of unequal
-    length weigh what they lasted. Dividing lets runs of unequal lengths be cut to the shortest and compared.
+    length weigh what they lasted. Episodes that ended between the same two reports carry the same step; their mean
+    holds. Dividing lets runs of unequal lengths be cut to the shortest and compared.
 
     Args:
-        steps: environment steps at each episode's end, rising.
+        steps: environment steps at each episode's end, never falling.
         values: of each episode.
         start: first step that counts.
         end: last step that counts.
@@ -133,8 +123,10 @@ def area_under_curve(
         raise ValueError(f"start = {start}, end = {end}: the area needs a range of steps")
     if len(steps) == 0 or steps[-1] < end:
         raise ValueError(f"end = {end}: the curve ends before; cut to the shortest of the curves")
-    edges = np.clip(np.concatenate([[start], steps]), start, end)
-    return float((values * np.diff(edges)).sum() / (end - start))
+    ends, place = np.unique(steps, return_inverse=True)
+    means = np.bincount(place, values) / np.bincount(place)
+    edges = np.clip(np.concatenate([[start], ends]), start, end)
+    return float((means * np.diff(edges)).sum() / (end - start))
 
 
 def mean_of_last(values: Float64[np.ndarray, " episodes"], count: int) -> float:

@@ -16,7 +16,7 @@ from slotfilm_dist.evaluation.study.collection import StudyRun
 from slotfilm_dist.evaluation.study.curves import draw_lines
 from slotfilm_dist.evaluation.study.draft import NONE, Draft, mean_and_deviation, shown
 from slotfilm_dist.evaluation.study.estimates import curve_band, estimate_iqm, held_curve
-from slotfilm_dist.evaluation.study.how_to import measure_command, train_commands
+from slotfilm_dist.evaluation.study.how_to import measure_command, measured_otherwise, train_commands
 from slotfilm_dist.evaluation.study.measurements import Measurement, in_one_way, measured
 from slotfilm_dist.variants import VARIANTS
 
@@ -44,7 +44,9 @@ def components_section(draft: Draft, item: paper.Item) -> Section:
             f"Components divided by their largest value, exponential moving average, of slotfilm; interquartile mean "
             f"over seeds ({len(runs)} at hand) with a 95 % bootstrap band, which a single seed does not have."
         )
-        section.blocks.extend([Picture(path=path, title=item.title, text=text), draft.made_by(runs)])
+        section.blocks.extend(
+            [Picture(path=path, title=item.title, text=text), draft.made_by(run.record for run in runs)]
+        )
         draft.tables[item.anchor] = [{"seed": run.seed} | row for run, rows in by_run for row in rows]
     section.blocks.append(Printed(lines=item.printed))
     if not runs:
@@ -82,7 +84,9 @@ def windows_section(draft: Draft, item: paper.Item) -> Section:
             "steps, means and deviations are over episodes (the paper's over steps, so its deviations are larger)."
         )
         head = ("window, component", "the paper", "here, IQM over seeds", "deviation within a run", "each seed")
-        section.blocks.extend([Table(caption=caption, head=head, rows=tuple(rows)), draft.made_by(runs)])
+        section.blocks.extend(
+            [Table(caption=caption, head=head, rows=tuple(rows)), draft.made_by(run.record for run in runs)]
+        )
     lines = () if rows else tuple(_window_in_words(window) for window in WINDOWS)
     section.blocks.append(Printed(lines=(*item.printed, *lines)))
     if not runs:
@@ -97,7 +101,7 @@ def probes_section(draft: Draft, item: paper.Item) -> Section:
     """Table 3: linear probes of the four variants, beside the paper's."""
     section = Section(anchor=item.anchor, title=f"{item.number}: {item.title}")
     runs = [run for name in item.variants for run in draft.study.of(name)]
-    found = in_one_way(measured(runs, "probe/*/probes.json"))
+    found, left_out = in_one_way(measured(runs, "probe/*/probes.json"))
     draft.tables[item.anchor] = [line for m in found for line in _probe_lines(m)]
     labels = [label for _, label in paper.PROBE_SCORES]
     rows: list[tuple[str, ...]] = []
@@ -115,12 +119,13 @@ def probes_section(draft: Draft, item: paper.Item) -> Section:
             "or “visual” is not said; both are given. |x|: printed without its sign. Null: AUROC with shuffled labels."
         )
         head = ("variant, latent", "seeds", *labels, "null")
-        commands = tuple(_probe_command(m) for m in found)
+        commands = tuple(measure_command(m.run, "probe RUN", m.options) for m in found)
         table = Table(caption=caption, head=head, rows=tuple(rows))
         section.blocks.extend([table, Commands(text="Measured by", commands=commands)])
+        section.blocks.extend(measured_otherwise(left_out, found[0], "probe RUN"))
     lines = () if found else tuple(_in_words(name, labels, paper.TABLE_3[name]) for name in item.variants)
     section.blocks.append(Printed(lines=(*item.printed, *lines)))
-    section.blocks.extend(_unprobed(draft, item, {m.run.variant for m in found}))
+    section.blocks.extend(_unprobed(draft, item, found, left_out))
     return section
 
 
@@ -128,7 +133,7 @@ def robustness_section(draft: Draft) -> Section:
     """Success of policies with a corrupted camera, by variant; empty without measurements."""
     section = Section(anchor="robustness", title="Success with a corrupted camera")
     runs = [run for name in VARIANTS for run in draft.study.of(name)]
-    found = measured(runs, "robustness/policy.json")
+    found, left_out = in_one_way(measured(runs, "robustness/policy.json"))
     pooled: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for m in found:
         for name, episodes in m.values.get("episodes", {}).items():
@@ -143,9 +148,11 @@ def robustness_section(draft: Draft) -> Section:
     if rows:
         caption = "All seeds together, with 95 % Wilson intervals; return at reward scale 10. Not in the paper."
         head = ("variant, pictures", "solved at end", "share", "return")
-        commands = tuple(measure_command(m.run, "evaluate RUN --what robustness") for m in found)
+        command = "evaluate RUN --what robustness"
+        commands = tuple(measure_command(m.run, command, m.options) for m in found)
         table = Table(caption=caption, head=head, rows=tuple(rows))
         section.blocks.extend([table, Commands(text="Measured by", commands=commands)])
+        section.blocks.extend(measured_otherwise(left_out, found[0], command))
         draft.tables["robustness"] = [
             {"variant": m.run.variant, "seed": m.run.seed} | row for m in found for row in m.values.get("rows", [])
         ]
@@ -204,22 +211,20 @@ def _probe_lines(m: Measurement) -> list[dict[str, Any]]:
     ]
 
 
-def _probe_command(m: Measurement) -> str:
-    frames = m.values.get("frames", {})
-    options = f"--frames {frames.get('source', 'expert')} --episodes {frames.get('episodes', 10)}"
-    return measure_command(m.run, f"probe RUN {options}")
-
-
-def _unprobed(draft: Draft, item: paper.Item, probed: set[str]) -> list[Block]:
-    """What the table lacks: variants without a run, and runs without a probe."""
+def _unprobed(
+    draft: Draft, item: paper.Item, found: Sequence[Measurement], left_out: Sequence[Measurement]
+) -> list[Block]:
+    """What the table lacks: variants without a run, and runs of variants without any probe."""
     blocks: list[Block] = []
     untrained = [name for name in item.variants if not draft.study.of(name)]
     if untrained:
         text = f"No run that is over: {', '.join(untrained)}."
         blocks.append(Missing(text=text, commands=train_commands(draft.study, untrained)))
+    probed = {m.run.variant for m in (*found, *left_out)}
     waiting = [run for name in item.variants if name not in probed for run in draft.study.of(name)]
     if waiting:
-        commands = tuple(measure_command(run, "probe RUN") for run in waiting)
-        text = "Not probed on the same frames as the rest." if probed else "No agent was probed."
+        commands = tuple(measure_command(run, "probe RUN", found[0].options if found else None) for run in waiting)
+        names = ", ".join(dict.fromkeys(run.variant for run in waiting))
+        text = f"Not probed: {names}." if found else "No agent was probed."
         blocks.append(Missing(text=text, commands=commands))
     return blocks

@@ -25,6 +25,34 @@ class Measurement:
     folder: Path
     values: dict[str, Any]
 
+    @property
+    def options(self) -> dict[str, str]:
+        """Options of the command that made it, as far as its file tells them."""
+        frames, played = self.values.get("frames", {}), self.values.get("episodes", {})
+        found = {
+            "--checkpoint": self.values.get("checkpoint"),
+            "--hold": self.values.get("hold"),
+            "--frames": frames.get("source"),
+            "--episodes": frames.get("episodes", max(map(len, played.values()), default=None)),
+            "--steps": frames.get("steps"),
+            "--seed": frames.get("first_seed", self.values.get("first_seed")),
+        }
+        return {option: str(value) for option, value in found.items() if value is not None}
+
+    @property
+    def stage(self) -> str:
+        """After how much training, in words; empty where it is unknown, or another one for every run's best."""
+        steps = self.values.get("env_steps")
+        if not isinstance(steps, int) or self.values.get("checkpoint") == "best":
+            return ""
+        # Runs of several workers end a few steps apart.
+        return "at the end of training" if steps >= self.run.config.schedule.total_steps else f"after {steps} steps"
+
+    @property
+    def way(self) -> tuple[object, ...]:
+        """How it was made: measurements of different runs may stand side by side where this is the same."""
+        return self.folder.name, *self.options.items(), self.stage
+
 
 def measured(runs: Sequence[StudyRun], pattern: str) -> list[Measurement]:
     """JSON files of runs that match a pattern below their directories; damaged ones are passed over."""
@@ -36,23 +64,27 @@ def measured(runs: Sequence[StudyRun], pattern: str) -> list[Measurement]:
     return found
 
 
-def in_one_way(measurements: Sequence[Measurement], preferred: Sequence[str] = ()) -> list[Measurement]:
-    """Those made in the same way, so that they may stand side by side: one a run, from folders of the same name.
+def in_one_way(
+    measurements: Sequence[Measurement], preferred: Sequence[str] = ()
+) -> tuple[list[Measurement], list[Measurement]]:
+    """Those made in the same way, one a run, and those of runs that were only measured in another way.
 
     Args:
         measurements: of any runs, whose folders are named after frames and checkpoint.
-        preferred: endings of folder names, best first; among equals the one that most runs have.
+        preferred: endings of folder names, best first; among equals the way that most runs were measured in.
     """
-    counts = Counter(m.folder.name for m in measurements)
+    counts = Counter(m.way for m in measurements)
     if not counts:
-        return []
+        return [], []
 
-    def rank(name: str) -> tuple[int, int]:
-        ending = next((i for i, end in enumerate(preferred) if name.endswith(end)), len(preferred))
-        return ending, -counts[name]
+    def rank(way: tuple[object, ...]) -> tuple[int, int]:
+        ending = next((i for i, end in enumerate(preferred) if str(way[0]).endswith(end)), len(preferred))
+        return ending, -counts[way]
 
-    chosen = min(sorted(counts), key=rank)
-    return [m for m in measurements if m.folder.name == chosen]
+    chosen = min(counts, key=rank)
+    kept = [m for m in measurements if m.way == chosen]
+    paths = {m.run.path for m in kept}
+    return kept, [m for m in measurements if m.run.path not in paths]
 
 
 def read_object(path: Path) -> dict[str, Any]:

@@ -115,7 +115,7 @@ def run_numbers(run: StudyRun, until: int) -> RunNumbers:
     steps, returns = training_returns(run)
     window = min(LAST_EPISODES, len(returns))
     start = min(run.config.schedule.random_steps, until - 1)
-    final = run.record.evaluation("final")
+    final = run.record.final
     episodes = final.episodes if final else ()
     return RunNumbers(
         run=run,

@@ -15,7 +15,7 @@ from slotfilm_dist.evaluation.study.blocks import Block, Commands, Missing, Pict
 from slotfilm_dist.evaluation.study.collection import StudyRun
 from slotfilm_dist.evaluation.study.curves import draw_lines
 from slotfilm_dist.evaluation.study.draft import NONE, Draft
-from slotfilm_dist.evaluation.study.how_to import measure_command, train_commands
+from slotfilm_dist.evaluation.study.how_to import measure_command, measured_otherwise, train_commands
 from slotfilm_dist.evaluation.study.measurements import Measurement, in_one_way, measured, take_picture
 from slotfilm_dist.evaluation.study.paper import Item
 
@@ -32,6 +32,7 @@ _LOSSES = (
     ("pretrain_visibility_loss", "(c) visibility", "nats"),
 )
 _MOST_FILMS = 3
+_PERCEPTION = "evaluate RUN --what perception"
 _PREFERRED = ("-pretrained", "-last")
 
 
@@ -61,11 +62,12 @@ def pretraining_section(draft: Draft, item: Item) -> Section:
     records = [r for r in (*draft.study.makers, *(run.record for run in runs)) if _pretrained(r)]
     if records:
         section.blocks.append(_losses(draft, item, records))
-    found = in_one_way(measured(runs, "perception/*/quality.json"), _PREFERRED)
+    found, left_out = in_one_way(measured(runs, "perception/*/quality.json"), _PREFERRED)
     if found:
         section.blocks.extend([_quality_table(draft, found), _perception_command(found)])
+        section.blocks.extend(measured_otherwise(left_out, found[0], _PERCEPTION))
     if records:
-        section.blocks.append(draft.made_by(runs))
+        section.blocks.append(draft.made_by(records))
     section.blocks.append(Printed(lines=item.printed))
     if not records:
         text = "No run at hand has logged pre-training; those that took an encoder from the artifacts have not."
@@ -73,7 +75,7 @@ def pretraining_section(draft: Draft, item: Item) -> Section:
         section.blocks.append(Missing(text=text, commands=(*commands[:1],)))
     if not found:
         text = "Errors on held-out frames: perception of the proposed agent was not measured."
-        commands = (measure_command(runs[0], "evaluate RUN --what perception"),) if runs else ()
+        commands = (measure_command(runs[0], _PERCEPTION),) if runs else ()
         section.blocks.append(Missing(text=text, commands=commands))
     return section
 
@@ -91,13 +93,13 @@ def _lacking(draft: Draft, item: Item, runs: Sequence[StudyRun]) -> Missing:
     what, command = {
         "Figure 6": ("A real camera was not looked at", "perceive SOURCE --checkpoint RUN --out RUN/perceive/NAME.png"),
         "Figure 8": ("No film strip was made", "evaluate RUN --what film_strips"),
-    }.get(item.number, ("Perception was not measured", "evaluate RUN --what perception"))
+    }.get(item.number, ("Perception was not measured", _PERCEPTION))
     text = f"{what} with any run of {item.variants[0]}."
     return Missing(text=text, commands=(measure_command(runs[0], command),))
 
 
 def _perceived(draft: Draft, item: Item, runs: Sequence[StudyRun], name: str) -> list[Block]:
-    found = [m for m in in_one_way(measured(runs, "perception/*/quality.json"), _PREFERRED) if _there(m, name)]
+    found, _ = in_one_way([m for m in measured(runs, "perception/*/quality.json") if _there(m, name)], _PREFERRED)
     if not found:
         return []
     first = found[0]
@@ -123,18 +125,8 @@ def _who(measurement: Measurement) -> str:
 
 
 def _perception_command(found: Sequence[Measurement]) -> Commands:
-    commands = []
-    for m in found:
-        frames = m.values.get("frames", {})
-        options = [
-            f"--{option} {frames[key]}"
-            for option, key in (("frames", "source"), ("episodes", "episodes"), ("steps", "steps"))
-            if key in frames
-        ]
-        which = m.values.get("checkpoint", "last")
-        words = f"evaluate RUN --what perception --checkpoint {which} {' '.join(options)}"
-        commands.append(measure_command(m.run, words.strip()))
-    return Commands(text="Measured by", commands=tuple(commands))
+    commands = tuple(measure_command(m.run, _PERCEPTION, m.options) for m in found)
+    return Commands(text="Measured by", commands=commands)
 
 
 def _camera(draft: Draft, item: Item, runs: Sequence[StudyRun]) -> list[Block]:
@@ -160,6 +152,7 @@ def _folders(folder: Path) -> list[Path]:
 def _films(draft: Draft, item: Item, runs: Sequence[StudyRun]) -> list[Block]:
     strips = [(run, path) for run in runs for path in sorted(run.path.glob("film_strips/agent-*.png"))]
     blocks: list[Block] = []
+    commands: list[str] = []
     for index, (run, source) in enumerate(strips[:_MOST_FILMS]):
         path = take_picture(source, draft.picture(f"{item.anchor}-{index + 1}"))
         seed = source.stem.removeprefix("agent-")
@@ -168,11 +161,10 @@ def _films(draft: Draft, item: Item, runs: Sequence[StudyRun]) -> list[Block]:
             "reached is named (reach, grasp, transport, place, hold), the others only numbered."
         )
         blocks.append(Picture(path=path, title="Episode of the trained agent", text=text))
+        commands.append(measure_command(run, f"evaluate RUN --what film_strips --seed {seed} --episodes 1"))
     if not blocks:
         return []
-    runs_shown = dict.fromkeys(run.path for run, _ in strips[:_MOST_FILMS])
-    commands = tuple(f"slotfilm evaluate {path} --what film_strips" for path in runs_shown)
-    return [*blocks, Commands(text="Made by", commands=commands)]
+    return [*blocks, Commands(text="Made by", commands=tuple(commands))]
 
 
 def _pretrained(record: RunRecord) -> bool:

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.envs.reward_bounds import max_reward
 from slotfilm_dist.evaluation import page_parts as html
 from slotfilm_dist.evaluation.study.blocks import Block, Missing, Picture, Printed, Section, Table, Text
 from slotfilm_dist.evaluation.study.curves import (
@@ -81,7 +83,7 @@ def _compared(draft: Draft, name: str, variants: Sequence[str], printed: dict[st
     )
     blocks: list[Block] = [Picture(path=path, title=name.replace("-", " ").capitalize(), text=text)]
     if numbers:
-        blocks.append(returns_table(numbers, reference.env.max_steps, printed))
+        blocks.append(returns_table(numbers, reference, printed))
     if _OWN_REWARD & {n.variant for n in numbers}:
         blocks.append(
             Text(
@@ -89,7 +91,7 @@ def _compared(draft: Draft, name: str, variants: Sequence[str], printed: dict[st
                 "it ranks them only roughly. Success, which is the same for all, is in the table of results."
             )
         )
-    return [*blocks, draft.made_by([*runs, *cut])]
+    return [*blocks, draft.made_by(run.record for run in (*runs, *cut))]
 
 
 def _curve_rows(curve: VariantCurve) -> list[dict[str, Any]]:
@@ -107,8 +109,14 @@ def _curve_rows(curve: VariantCurve) -> list[dict[str, Any]]:
     ]
 
 
-def returns_table(numbers: Sequence[VariantNumbers], episode_steps: int, printed: dict[str, str]) -> Table:
-    """Numbers of the variants, beside what the paper printed of each if it printed anything."""
+def returns_table(numbers: Sequence[VariantNumbers], reference: RunConfig, printed: dict[str, str]) -> Table:
+    """Numbers of the variants, beside what the paper printed of each if it printed anything.
+
+    Args:
+        numbers: of the variants.
+        reference: the config whose episodes and reward stand for all.
+        printed: the paper's returns by variant.
+    """
     rows = []
     for n in numbers:
         cells = [
@@ -123,7 +131,9 @@ def returns_table(numbers: Sequence[VariantNumbers], episode_steps: int, printed
         rows.append(
             (*cells, printed.get(n.variant, NONE).replace(" ", "\N{NO-BREAK SPACE}")) if printed else tuple(cells)
         )
-    bound = f"At most {html.number(10 * episode_steps, 0)} in an episode of {episode_steps} steps"
+    episode_steps = reference.env.max_steps
+    highest = html.number(10 * max_reward(reference.reward) * episode_steps, 0)
+    bound = f"At most {highest} in an episode of {episode_steps} steps"
     other = f", {html.number(10 * PAPER_STEPS, 0)} in the paper's of {PAPER_STEPS}" if episode_steps != 400 else ""
     caption = (
         "Return at reward scale 10, interquartile mean over seeds with 95 % stratified bootstrap interval, which a "
@@ -151,7 +161,7 @@ def results_section(draft: Draft) -> Section:
     )
     text = "Dots: seeds. Bar: interquartile mean; line: its 95 % stratified bootstrap interval, none for one seed."
     section.blocks.append(Picture(path=path, title="Final return", text=text))
-    section.blocks.append(returns_table(numbers, draft.study.reference.config.env.max_steps, {}))
+    section.blocks.append(returns_table(numbers, draft.study.reference.config, {}))
     path = draw_points(
         numbers,
         draft.picture("success"),
@@ -197,7 +207,7 @@ def _success_table(numbers: Sequence[VariantNumbers]) -> Table:
 
 
 def _final(numbers: Any) -> Sequence[Any]:
-    final = numbers.run.record.evaluation("final")
+    final = numbers.run.record.final
     return final.episodes if final else ()
 
 

@@ -183,7 +183,6 @@ def _runs(draft: Draft) -> Section:
         text = "Some runs have fewer than 100 episodes of their own policy; “last 100” is then the mean of all of them."
         blocks.append(Text(text=text))
     blocks += [Missing(text=line) for line in study.left_out]
-    commands = study.commands or tuple(dict.fromkeys(run.command for run in study.runs if run.command))
-    blocks.append(Commands(text="Made by", commands=commands))
+    blocks.append(draft.made_by(run.record for run in (*study.runs, *study.unfinished)))
     section.blocks.extend(blocks)
     return section

@@ -1,6 +1,7 @@
 """Settings and machines beside the paper's: Table 1 and Tables A1 to A4, from configs, `versions.json` and costs."""
 
 import dataclasses
+import shlex
 from collections.abc import Mapping
 from typing import Any
 
@@ -78,7 +79,7 @@ def _machines(draft: Draft, section: Section) -> None:
 
 
 def _costs(draft: Draft, section: Section) -> None:
-    command = f"slotfilm cost --json > {draft.study.folder / COST_FILE}"
+    command = f"slotfilm cost --json > {shlex.quote(str(draft.study.folder / COST_FILE))}"
     proposed = next((row for row in draft.costs if row.get("variant") == "slotfilm"), None)
     if proposed is None:
         text = f"The study's folder holds no {COST_FILE} with a row of slotfilm."
