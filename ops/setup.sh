@@ -42,7 +42,7 @@ find_python() {
     python=$PYTHON
     return
   fi
-  for candidate in python3 python3.12 python3.11 python "${PYENV_ROOT:-$HOME/.pyenv}"/versions/3.1[12].*/bin/python; do
+  for candidate in python3 python3.12 python3.11 python "${PYENV_ROOT:-${HOME:-}/.pyenv}"/versions/3.1[12].*/bin/python; do
     reason=$(objection "$candidate") || continue
     python=$candidate
     [ -n "$reason" ] || return 0
@@ -60,7 +60,8 @@ up_to_date() { [ -x "$venv/bin/python" ] && [ -f "$stamp" ] && [ "$(cat "$stamp"
 make_venv() {
   if [ -e "$venv" ]; then
     local reason place
-    place=$(sed -n 's/^VIRTUAL_ENV=//p' "$venv/bin/activate" 2>/dev/null | tr -d "\"'" | head -n 1) || true
+    # Python 3.12 exports it in a branch of its own, behind one for Cygwin.
+    place=$(sed -nE 's/^ *(export )?VIRTUAL_ENV=//p' "$venv/bin/activate" 2>/dev/null | tr -d "\"'" | tail -n 1) || true
     if reason=$(objection "$venv/bin/python") && [ -z "$reason" ] && [ "$place" = "$(pwd -P)/$venv" ]; then return; fi
     [ -f "$stamp" ] || [ -f "$log" ] ||
       die "$venv is not a working virtual environment of this folder with Python 3.11 or 3.12, and not made by this script; move it away and run this again"
@@ -97,14 +98,17 @@ install_project() {
 
 # Install packages without starting their services, now or with the machine: prometheus listens on every address.
 install_without_services() {
-  local policy=/usr/sbin/policy-rc.d made="" status=0 package
-  if [ ! -e "$policy" ]; then
-    printf '#!/bin/sh\nexit 101\n' | as_root tee "$policy" >/dev/null
+  local policy=/usr/sbin/policy-rc.d mark="# by slotfilm's set-up" status=0 package
+  # One that an earlier set-up left behind, killed on the spot, is ours as well.
+  if [ ! -e "$policy" ] || grep -qxF "$mark" "$policy"; then
+    trap 'as_root rm -f /usr/sbin/policy-rc.d' EXIT
+    trap 'exit 130' INT TERM HUP
+    printf '#!/bin/sh\n%s\nexit 101\n' "$mark" | as_root tee "$policy" >/dev/null
     as_root chmod 755 "$policy"
-    made=1
   fi
   apt_install "$@" || status=$?
-  if [ -n "$made" ]; then as_root rm -f "$policy"; fi
+  if grep -qxF "$mark" "$policy" 2>/dev/null; then as_root rm -f "$policy"; fi
+  trap - EXIT INT TERM HUP
   for package in "$@"; do
     if [ -e "/etc/init.d/$package" ]; then as_root update-rc.d "$package" disable >/dev/null 2>&1 || true; fi
   done

@@ -58,7 +58,7 @@ fi
 say "installing a software Vulkan driver (Mesa lavapipe, $min_mesa or newer)"
 apt_update || die "apt-get update failed; check this machine's package sources"
 
-candidate() { apt-cache policy mesa-vulkan-drivers | awk '/Candidate:/ {print $2}'; }
+candidate() { LC_ALL=C apt-cache policy mesa-vulkan-drivers | awk '/Candidate:/ {print $2}'; }
 suites() { apt-get indextargets --format '$(CODENAME) $(SUITE) $(REPO_URI)'; }
 add_backports() {
   local suite="$1" codename="$2" file=/etc/apt/sources.list.d/slotfilm-backports.sources mirror key

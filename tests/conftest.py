@@ -24,6 +24,13 @@ _ray_files = tempfile.TemporaryDirectory(prefix="slotfilm-ray-")
 os.environ["RAY_AUTH_MODE"] = "disabled"
 os.environ["RAY_AUTH_TOKEN_PATH"] = str(Path(_ray_files.name) / "token")
 os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+# A process reads it once, before its first cluster; otherwise metrics are reported every 10 s.
+os.environ["RAY_metrics_report_interval_ms"] = "1000"  # noqa: SIM112
+
+# Of whoever runs the tests: colours and widths would change what is printed, a proxy would be asked for the loopback.
+for _name in ("FORCE_COLOR", "COLUMNS", "LINES"):
+    os.environ.pop(_name, None)
+os.environ["no_proxy"] = "127.0.0.1,localhost"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -53,7 +60,7 @@ def write_agent_run() -> Callable[..., Path]:
     def write_agent_run(folder: Path, config: Any, learner: Any = None) -> Path:
         import torch
 
-        from slotfilm_dist.config import save_config
+        from slotfilm_dist.config_files import save_config
         from slotfilm_dist.learning.checkpoint import CheckpointStore
         from slotfilm_dist.learning.learner import Learner
 
@@ -66,3 +73,23 @@ def write_agent_run() -> Callable[..., Path]:
         return folder
 
     return write_agent_run
+
+
+@pytest.fixture(scope="session")
+def still_running() -> Callable[[Any, float], Any]:
+    """Waits for processes to end; gives those that have not. One that nobody has asked for its exit code has ended."""
+
+    def still_running(processes: Any, timeout_s: float) -> Any:
+        import psutil
+
+        _, there = psutil.wait_procs(processes, timeout=timeout_s)
+        running = []
+        for process in there:
+            try:
+                if process.status() != psutil.STATUS_ZOMBIE:
+                    running.append(process)
+            except psutil.NoSuchProcess:
+                continue
+        return running
+
+    return still_running

@@ -11,12 +11,13 @@ from slotfilm_dist.cluster.hub import Hub, build_limiter
 from slotfilm_dist.cluster.hub_client import HubClient
 from slotfilm_dist.cluster.replay_client import ReplayClient, ShardClient
 from slotfilm_dist.cluster.session import Session
-from slotfilm_dist.cluster.shard_role import build_shard
+from slotfilm_dist.cluster.shard_role import FencedShard
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.contracts import ReplayStore
 from slotfilm_dist.messages import TransitionBlock
 from slotfilm_dist.presets import smoke
 from slotfilm_dist.replay.schema import ReplaySchema
+from slotfilm_dist.replay.shard import build_shard
 from slotfilm_dist.replay.sharded import ShardedReplay
 
 PLACES = ("in_process", "ray")
@@ -24,7 +25,7 @@ SCHEMA = ReplaySchema(visual_kind="none", visual_shape=(0,), proprio_dim=3, acti
 NUM_SHARDS = 2
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def session() -> Iterator[Session]:
     cluster = Session(num_cpus=2)
     yield cluster
@@ -56,12 +57,14 @@ def store(place: str, config: RunConfig, tmp_path: Path) -> Iterator[ReplayStore
     """Two shards of 200 steps each."""
     seed = np.random.SeedSequence(5)
     if place == "in_process":
-        yield ShardedReplay([build_shard(config, SCHEMA, index) for index in range(NUM_SHARDS)], seed)
+        yield ShardedReplay([build_shard(FencedShard, config, SCHEMA, index) for index in range(NUM_SHARDS)], seed)
         return
     shards = [
         ShardClient.launch(config, SCHEMA, index, tmp_path / f"shard-{index}", resume=False, resources={})
         for index in range(NUM_SHARDS)
     ]
+    for shard in shards:
+        shard.beat()  # until its process has started
     yield ReplayClient(shards, seed)
     for shard in shards:
         shard.kill()

@@ -21,7 +21,7 @@ from slotfilm_dist.variants import apply_variant
 RANDOM_STEPS = 200
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def session() -> Iterator[Session]:
     # More than there may be: room for workers beyond the first ones; on few cores everything is only slower.
     cluster = Session(num_cpus=8)

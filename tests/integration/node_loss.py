@@ -19,13 +19,13 @@ from ray.cluster_utils import Cluster
 from slotfilm_dist.backend import TrainReport
 from slotfilm_dist.cluster.backend import RayBackend
 from slotfilm_dist.cluster.placement import STATE_RESOURCE, WORKER_RESOURCE
-from slotfilm_dist.config import load_config
+from slotfilm_dist.config_files import load_config
 from slotfilm_dist.envs.toy import make_slow_toy_env
 
 MEASURE_S = 5.0
 """Time over which env steps a second are taken."""
 NUM_WORKERS = 2
-LIMIT_S = 75.0
+LIMIT_S = 150.0
 """Longest wait for each of the stages."""
 
 

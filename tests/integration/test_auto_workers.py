@@ -2,11 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
+
+import ray
+from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
 from slotfilm_dist.backend import TrainReport
 from slotfilm_dist.cluster.backend import RayBackend
+from slotfilm_dist.cluster.session import Session
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.envs.toy import make_slow_toy_env
 
@@ -48,5 +51,21 @@ def test_workers_that_wait_for_the_learner_are_removed(
     backend.want_auto_workers()
     reports = reports_until(backend, make_dataset(auto), lambda r: r.metrics["worker_alive_count"] == 1)
     assert reports[-2].metrics["worker_alive_count"] == 1
-    updates = [report.updates for report in reports]
-    assert all(later > earlier for earlier, later in pairwise(updates[2:-1])), updates
+    updates = [report.updates for report in reports if report.updates]
+    assert all(later > earlier for earlier, later in zip(updates, updates[3:-1], strict=False)), updates
+
+
+def test_placement_group_has_no_cores_for_further_workers(session: Session) -> None:
+    """A trial's group holds its first roles exactly; a worker that asked for more would wait in it for ever."""
+    group = ray.util.placement_group([{"CPU": 0.5}])
+    inside = PlacementGroupSchedulingStrategy(placement_group=group, placement_group_capture_child_tasks=True)
+
+    def available() -> float:
+        return Session().available_cpus()
+
+    ask = ray.remote(num_cpus=0)(available)
+    try:
+        assert ray.get(ask.options(scheduling_strategy=inside).remote(), timeout=60) == 0.0
+        assert ray.get(ask.remote(), timeout=60) > 0.0
+    finally:
+        ray.util.remove_placement_group(group)

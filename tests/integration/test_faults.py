@@ -1,9 +1,10 @@
-"""What happens when a process of a live run is killed."""
+"""What happens when a process of a live run is killed, and when there is no memory."""
 
 import os
 import signal
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,26 @@ def test_learner_waits_while_all_workers_are_gone_and_goes_on(live: LiveRun) -> 
     took_s += live.until(lambda r: r.env_steps > steps + 200, "more steps")
     print(f"all workers killed: collecting again after {took_s:.1f} s")
     assert_exact(live)
+
+
+def test_system_without_memory_ends_workers_first_and_hub_and_driver_last(live: LiveRun) -> None:
+    pids = live.backend.process_ids() | {"driver": os.getpid()}
+    scores = {name: int(Path(f"/proc/{pid}/oom_score").read_text()) for name, pid in pids.items()}
+    worker, shard = (min(score for n, score in scores.items() if n.startswith(kind)) for kind in ("worker", "shard"))
+    assert worker > max(scores["shard 0"], scores["shard 1"]), scores
+    assert shard > scores["learner"] > max(scores["hub"], scores["driver"]), scores
+
+
+def test_run_goes_on_with_one_worker_on_a_machine_short_of_memory(
+    start: Start, config: RunConfig, make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    config = replace(config, runtime=replace(config.runtime, max_memory_share=0.001))  # any machine uses more
+    run = LiveRun(start(config, tmp_path / "run"), make_dataset(config))
+    run.until(lambda r: r.metrics.get("worker_restarts_total/memory", 0) == 1, "a worker that stands still")
+    steps, updates = run.last.env_steps, run.last.updates
+    run.until(lambda r: r.env_steps > steps + 200 and r.updates > updates + 50, "steps and updates")
+    assert run.last.metrics["worker_alive_count"] == 1
+    assert_exact(run)
 
 
 def test_sampling_goes_on_without_a_killed_shard(live: LiveRun) -> None:

@@ -9,14 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slotfilm_dist.backend import RunFailedError, TrainReport
+from slotfilm_dist.backend import EvaluationFailedError, RunFailedError, TrainReport
 from slotfilm_dist.chaos.black_picture import black_picture
 from slotfilm_dist.chaos.faulty_env import BROKEN_STEPS, make_faulty_env
 from slotfilm_dist.chaos.switches import Switches
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.envs.toy import make_toy_env
+from slotfilm_dist.learning.learner import Learner
+from slotfilm_dist.learning.off_policy import TrainingDivergedError
 from slotfilm_dist.local import LocalBackend
 from slotfilm_dist.local_envs import MAX_BROKEN
+from slotfilm_dist.messages import SampleBatch
 
 MakeDataset = Callable[[RunConfig], Path]
 
@@ -70,6 +73,19 @@ def test_broken_environment_is_replaced_and_the_run_reaches_its_end(
     assert report.metrics["worker_nonfinite_total"] == BROKEN_STEPS
 
 
+@pytest.mark.parametrize("fault", ["nan_reward", "nan_state"])
+def test_episode_that_cannot_be_judged_by_fails_its_evaluation_alone(
+    local: RunConfig, make_dataset: MakeDataset, tmp_path: Path, switches: Switches, fault: str
+) -> None:
+    backend = begun(local, make_dataset(local), tmp_path / "switches")
+    switches.arm(fault)
+    with pytest.raises(EvaluationFailedError, match=r"a step of the episode of seed 7 .*slotfilm doctor"):
+        list(backend.play("agent", [7], lambda: False))
+    (episode,) = backend.play("agent", [7], lambda: False)
+    assert np.isfinite(episode.episode_return)
+    backend.close()
+
+
 def test_run_stops_when_every_environment_breaks(
     local: RunConfig, make_dataset: MakeDataset, tmp_path: Path, switches: Switches
 ) -> None:
@@ -77,6 +93,58 @@ def test_run_stops_when_every_environment_breaks(
     switches.arm("nan_reward", count=BROKEN_STEPS * MAX_BROKEN)
     with pytest.raises(RunFailedError, match=f"{MAX_BROKEN} environments were given up, .*--resume"):
         last_report(backend)
+
+
+def test_updates_that_a_return_to_a_checkpoint_loses_are_made_again_and_every_step_is_counted(
+    local: RunConfig, make_dataset: MakeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset, checkpoints = make_dataset(local), tmp_path / "checkpoints"
+    early = replace(local, schedule=replace(local.schedule, total_steps=232))
+    first = begun(early, dataset, tmp_path / "switches")
+    last_report(first)
+    first.save(checkpoints, {}, with_replay=True)
+    backend = begun(local, dataset, tmp_path / "switches", resume_from=checkpoints)
+    made, update = [0], Learner.update
+
+    def diverges_once(learner: Learner, batch: SampleBatch) -> None:
+        made[0] += 1
+        if made[0] == 150:
+            raise TrainingDivergedError("made to diverge")
+        update(learner, batch)
+
+    monkeypatch.setattr(Learner, "update", diverges_once)
+    report = last_report(backend)
+    assert report.metrics["learner_rollbacks_total"] == 1
+    assert (report.env_steps, report.updates) == (600, 200)
+    assert backend._store.num_steps() == 600
+    assert made[0] == 184 + 149 + 1  # those still due after 16, those made in vain, and the one that diverged
+
+
+def test_steps_after_a_fallback_to_an_older_checkpoint_are_stored_although_replay_is_ahead_of_it(
+    local: RunConfig, make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    folder, dataset = tmp_path / "checkpoints", make_dataset(local)
+    for total_steps in (280, 400):
+        part = replace(local, schedule=replace(local.schedule, total_steps=total_steps))
+        backend = begun(part, dataset, tmp_path / "switches", folder if folder.exists() else None)
+        last_report(backend)
+        backend.save(folder, {}, with_replay=True)
+    newest = max(folder.glob("updates-*")) / "tensors.safetensors"
+    newest.write_bytes(newest.read_bytes()[:-1])
+    backend = begun(local, dataset, tmp_path / "switches", folder)
+    stored = backend._store.num_steps()
+    report = last_report(backend)
+    assert (report.env_steps, report.updates) == (600, 200)
+    assert stored == 400
+    assert backend._store.num_steps() == 400 + (600 - 280)
+
+
+def test_ratio_of_one_update_for_many_steps_is_kept(
+    local: RunConfig, make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    seldom = replace(local, schedule=replace(local.schedule, updates_per_step=0.005))
+    report = last_report(begun(seldom, make_dataset(seldom), tmp_path / "switches"))
+    assert (report.env_steps, report.updates) == (600, 2)
 
 
 def test_passed_over_checkpoint_is_told(

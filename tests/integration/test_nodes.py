@@ -7,7 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from slotfilm_dist.config import RunConfig, save_config
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config_files import save_config
 from slotfilm_dist.replay.dataset import open_dataset
 
 SCENARIO = Path(__file__).with_name("node_loss.py")
@@ -19,7 +20,7 @@ def test_workers_of_a_removed_node_work_on_another_one(
     save_config(replace(config, runtime=replace(config.runtime, metrics_port=0)), tmp_path / "config.json")
     dataset = make_dataset(config)
     child = subprocess.run(
-        [sys.executable, str(SCENARIO), str(tmp_path), str(dataset)], capture_output=True, text=True, timeout=220
+        [sys.executable, str(SCENARIO), str(tmp_path), str(dataset)], capture_output=True, text=True, timeout=550
     )
     assert child.returncode == 0, child.stderr[-3000:]
     told = json.loads(child.stdout.splitlines()[-1])

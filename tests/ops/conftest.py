@@ -5,6 +5,7 @@ import itertools
 import json
 import math
 import os
+import random
 import secrets
 import shutil
 import socket
@@ -33,8 +34,8 @@ from slotfilm_dist.stopping import StopFlag
 from slotfilm_dist.variants import apply_variant
 
 OPS = Path(__file__).parents[2] / "ops"
-REPORT_INTERVAL = "RAY_metrics_report_interval_ms"
-"""How often Ray's processes report their metrics to the agent that Prometheus asks; Ray spells it like this."""
+PORTS = range(20_000, 32_000)
+"""Above those of Ray's workers, below those that the system gives to whoever connects."""
 START_S = 30.0
 """Longest wait for Prometheus to answer."""
 CLUSTER_START_S = 90.0
@@ -114,6 +115,7 @@ class WatchedRun:
     """A run that has ended, and what was seen of it."""
 
     config: RunConfig
+    path: Path
     prometheus: Prometheus
     start: float
     end: float
@@ -121,6 +123,11 @@ class WatchedRun:
     def values(self, query: str) -> Series:
         """Values of a query during the run."""
         return self.prometheus.over_time(query, self.start, self.end)
+
+    def training(self, name: str) -> list[tuple[float, float]]:
+        """Values that the run itself wrote down while it trained, each with its time in seconds."""
+        lines = [json.loads(line) for line in (self.path / "metrics.jsonl").read_text().splitlines()]
+        return [(line["time_s"], line[name]) for line in lines if line["phase"] == "train" and name in line]
 
     def seconds_since_start(self) -> float:
         """Since before its first sample."""
@@ -132,10 +139,12 @@ class WatchedRun:
 
 
 def free_port() -> int:
-    """A loopback port that nobody uses now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+    """A loopback port that nobody uses now, and that the system gives nobody who does not ask for it."""
+    for port in random.sample(PORTS, len(PORTS)):
+        with contextlib.closing(socket.socket()) as probe, contextlib.suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
+    raise AssertionError(f"all of {PORTS} are in use")
 
 
 def watched_config(metrics_port: int) -> RunConfig:
@@ -177,7 +186,6 @@ def watched(tmp_path_factory: pytest.TempPathFactory, program: Callable[[str], s
     folder = tmp_path_factory.mktemp("watched")
     config = watched_config(free_port())
     prometheus = Prometheus(folder, free_port())
-    os.environ[REPORT_INTERVAL] = "1000"  # milliseconds; 10 s otherwise
     try:
         start = time.time()
         with RunDirectory(folder / "watched", config) as run:
@@ -188,9 +196,8 @@ def watched(tmp_path_factory: pytest.TempPathFactory, program: Callable[[str], s
                 Pipeline(run, backend, folder / "artifacts", Progress(), StopFlag()).execute()
             finally:
                 backend.close()
-        yield WatchedRun(config=config, prometheus=prometheus, start=start, end=time.time())
+        yield WatchedRun(config=config, path=folder / "watched", prometheus=prometheus, start=start, end=time.time())
     finally:
-        del os.environ[REPORT_INTERVAL]
         prometheus.close()
 
 
@@ -237,11 +244,10 @@ class Home:
 
     def free_ports(self, count: int) -> list[int]:
         """Loopback ports that nobody uses now."""
-        with contextlib.ExitStack() as stack:
-            probes = [stack.enter_context(socket.socket()) for _ in range(count)]
-            for probe in probes:
-                probe.bind(("127.0.0.1", 0))
-            return [probe.getsockname()[1] for probe in probes]
+        ports: set[int] = set()
+        while len(ports) < count:
+            ports.add(free_port())
+        return list(ports)
 
     def get(self, url: str, token: str = "") -> tuple[int, str]:
         """Status and text of an answer; 0 while nobody answers."""

@@ -32,7 +32,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from slotfilm_dist.atomic import file_digest
-from slotfilm_dist.config import load_config, save_config, to_dict
+from slotfilm_dist.config_files import load_config, save_config, to_dict
 from slotfilm_dist.messages import TransitionBlock
 from slotfilm_dist.presets import smoke
 from slotfilm_dist.replay.codec import decode, encode

@@ -6,6 +6,7 @@ Prints one line once the cluster is there: where it and everything it started li
 end, so that the cluster can be asked things; then closes it and prints what is left of it.
 """
 
+import contextlib
 import json
 import os
 import sys
@@ -46,12 +47,13 @@ def main(folder: str, artifacts: str) -> None:
 
 def listening(process: psutil.Process) -> list[tuple[str, str, int]]:
     """Name of the process, address and port of everything at which it or what it started accepts connections."""
-    return [
-        (each.name(), connection.laddr.ip, connection.laddr.port)
-        for each in [process, *process.children(recursive=True)]
-        for connection in each.net_connections(kind="inet")
-        if connection.status == psutil.CONN_LISTEN
-    ]
+    found: list[tuple[str, str, int]] = []
+    for each in [process, *process.children(recursive=True)]:
+        with contextlib.suppress(psutil.NoSuchProcess):  # it may have ended since
+            name = each.name()
+            addresses = [c.laddr for c in each.net_connections(kind="inet") if c.status == psutil.CONN_LISTEN]
+            found += [(name, address.ip, address.port) for address in addresses]
+    return found
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """A run on its private cluster: where it listens, whom it answers, and what of its secrets reaches the disk."""
 
+import contextlib
 import ipaddress
 import json
 import os
 import subprocess
 import sys
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -137,14 +137,10 @@ def test_run_directory_holds_no_secret(run: PrivateRun) -> None:
 
 
 def test_processes_show_no_token_in_their_command_line(run: PrivateRun) -> None:
-    deadline = time.monotonic() + 10
     lines = b""
     for path in Path("/proc").glob("[0-9]*/cmdline"):
-        if time.monotonic() < deadline:
-            try:
-                lines += path.read_bytes() + b"\n"
-            except OSError:
-                continue
+        with contextlib.suppress(OSError):  # it may have ended since
+            lines += path.read_bytes() + b"\n"
     assert b"gcs_server" in lines
     assert run.token.encode() not in lines
 

@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
-pytestmark = [pytest.mark.sim, pytest.mark.render]
+pytestmark = [pytest.mark.sim, pytest.mark.render, pytest.mark.timeout(1500)]
 
 WORDS = ["grid", "smoke", "--only", "slotfilm,no_state,state_only", "--seeds", "1", "--retries", "0", "--json"]
 WORDS += ["--runtime.mode", "local", "--runtime.metrics_port", "0", "--evaluation.videos", "0"]
-LIMIT_S = 200.0
+LIMIT_S = 500.0
 
 
 def start(folder: Path) -> subprocess.Popen[str]:

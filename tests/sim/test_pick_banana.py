@@ -39,3 +39,14 @@ def test_pictures_come_through_gymnasium_without_the_objects_poses() -> None:
     green = (rgb[..., 1].int() > rgb[..., 0].int() + 80) & (rgb[..., 1].int() > rgb[..., 2].int() + 80)
     assert not green.any()
     env.close()
+
+
+def test_observation_after_a_reset_to_a_given_state_is_of_that_state() -> None:
+    env = gym.make("PickBanana-v1", obs_mode="state", render_backend="none")
+    wanted, _ = env.reset(seed=1)
+    states = env.unwrapped.get_state_dict()
+    other, _ = env.reset(seed=2)
+    assert not torch.allclose(other, wanted)
+    again, _ = env.reset(options={"reset_to_env_states": {"env_states": states}})
+    assert torch.allclose(again, wanted, atol=1e-5)
+    env.close()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from slotfilm_dist.config import EnvConfig, RunConfig
+from slotfilm_dist.config import STATE_FIELD_DIMS, EnvConfig, ObsConfig, RunConfig
 from slotfilm_dist.envs.expert import ExpertPolicy
 from slotfilm_dist.envs.scene import SceneReader
 from slotfilm_dist.envs.tasks import adapt_config
@@ -148,6 +148,21 @@ def test_unknown_controller_is_refused_with_the_known_ones() -> None:
     config = RunConfig(env=EnvConfig(control_mode="pd_ee"))
     with pytest.raises(ValueError, match=r"env\.control_mode = 'pd_ee'.*pd_ee_delta_pose"):
         WristEnv(config, camera=False)
+
+
+@pytest.mark.parametrize("mode", ["pd_joint_pos", "pd_ee_pose"])
+def test_controller_of_absolute_positions_is_refused(mode: str) -> None:
+    config = RunConfig(env=EnvConfig(control_mode=mode))
+    with pytest.raises(ValueError, match=rf"env\.control_mode = '{mode}': its actions .* take pd_ee_delta_pose"):
+        WristEnv(config, camera=False)
+
+
+def test_every_field_of_the_state_can_be_observed() -> None:
+    fields = tuple(name for name in STATE_FIELD_DIMS if name != "object_poses")
+    size = sum(STATE_FIELD_DIMS[name] for name in fields)
+    env = WristEnv(RunConfig(obs=ObsConfig(state_fields=fields, state_dim=size)), camera=False)
+    assert env.reset([1]).proprio.shape == (1, size)
+    env.close()
 
 
 @pytest.mark.render

@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from slotfilm_dist.__main__ import COMMANDS, main
-from slotfilm_dist.config import RunConfig, save_config
+from slotfilm_dist.commands.options import build_config
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config_files import save_config
 from slotfilm_dist.presets import smoke
 from slotfilm_dist.runs import RunDirectory
 
@@ -24,6 +26,7 @@ def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return told.err
 
 
+ON_STACKCUBE = ("--env.task", "StackCube-v1")
 NO_WEIGHTS = ("--encoder.backbone", "path", "--encoder.backbone_path", "nothing.pt")
 
 
@@ -44,6 +47,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (("train", "quik"), "did you mean 'quick'"),
         (("train", "--variant", "no_stat"), "did you mean 'no_state'"),
         (("train", "--env.task", "PickBanana"), "did you mean 'PickBanana-v1'"),
+        (("grid", "quick", *ON_STACKCUBE, "--encoder.goal", "--dry-run"), "encoder.goal = True: StackCube-v1 has no"),
+        (("grid", "quick", *ON_STACKCUBE, "--dry-run"), "--exclude slotfilm_goal"),
         (("train", "--sac.gama", "0.9"), "did you mean --sac.gamma"),
         (("train", "--sac.gamma", "2"), "sac.gamma"),
         (("train", "--sac.gamma", "high"), "sac.gamma"),
@@ -56,6 +61,20 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (("scale", "nowhere", "--workers", "0"), "--workers: 0: must be 1 or more, or auto"),
         (("scale", "nowhere", "--workers", "auto"), "nowhere has no cluster.json"),
         (("train", "--name", "a/b"), "--name"),
+        (("train", "--resume", ""), "was it an empty variable"),
+        (("train", "paper", "--resume", "run"), "leave a preset away"),
+        (("train", "--resume", "run", "--runs", "elsewhere"), "leave --runs away"),
+        (("train", "--encoder.pos_scale", "nan"), "encoder.pos_scale"),
+        (("train", "--env.far_m", "inf"), "env.far_m"),
+        (("train", "--sac.batch_size", "1" + 26 * "0"), "sac.batch_size"),
+        (("train", "--evaluation.seed", "99999999999999"), "evaluation.seed"),
+        (("grid", "quick", "--variant", "cnn", "--dry-run"), "`--only A,B` takes some"),
+        (("grid", "quick", "--only", "", "--dry-run"), "was it an empty variable"),
+        (("grid", "quick", "--seeds", "1000000000", "--dry-run"), "must be 10000 or fewer"),
+        (("chaos", "--minutes", "nan", "port_taken"), "--minutes and --soak"),
+        (("evaluate", "--policy", "random", "--seed", "5000000000"), "--seed 5000000000"),
+        (("cost", "--only", "slotfilm,no_stat"), "did you mean 'no_state'"),
+        (("train", "--sac.temperature", "0.1", "quick"), "the preset comes first"),
         (("train", "--resume", "nowhere"), "config.json does not exist"),
         (("evaluate",), "--policy expert"),
         (("evaluate", "nowhere"), "config.json does not exist"),
@@ -67,6 +86,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (("evaluate", "nowhere", "--what", "robustness"), "config.json does not exist"),
         (("probe", "nowhere"), "config.json does not exist"),
         (("probe", "nowhere", "--episodes", "1"), "--episodes 1"),
+        (("probe", "nowhere", "--seed", "-1"), "--seed -1"),
+        (("evaluate", "nowhere", "--what", "film_strips", "--seed", "-1"), "--seed -1"),
         (("perceive", "a.png", "--checkpoint", "nowhere", "--json"), "config.json does not exist"),
         (("perceive", "a.png"), "--checkpoint"),
         (("report", "nowhere"), "nowhere"),
@@ -80,6 +101,12 @@ def test_mistake_is_refused_in_one_sentence_before_anything_is_written(
 ) -> None:
     assert part in refusal(capsys, *words)
     assert list(place.iterdir()) == []
+
+
+@pytest.mark.parametrize(("variant", "field"), [("slotfilm_goal", ()), ("", ("--encoder.goal",))])
+def test_goal_query_on_a_task_without_a_goal_is_refused(variant: str, field: tuple[str, ...]) -> None:
+    with pytest.raises(ValueError, match=r"encoder\.goal = True: StackCube-v1 has no goal.*leave --encoder\.goal"):
+        build_config("quick", variant, (*ON_STACKCUBE, *field))
 
 
 def test_existing_run_and_corrupt_config_stay_as_they_are(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -98,6 +125,26 @@ def test_resuming_with_another_agent_is_refused(place: Path, capsys: pytest.Capt
     before = contents(place)
     assert "sac.gamma cannot change" in refusal(capsys, "train", "--resume", "run", "--sac.gamma", "0.5")
     assert contents(place) == before
+
+
+def test_folder_that_cannot_be_one_is_refused_before_anything_starts(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (place / "file").write_text("mine")
+    told = refusal(capsys, "train", "smoke", "--runtime.mode", "local", "--runs", "file")
+    assert "is a file, not a folder" in told
+    (place / "run" / "config.json").mkdir(parents=True)
+    assert "config.json cannot be read" in refusal(capsys, "train", "--resume", "run")
+    assert (place / "file").read_text() == "mine"
+
+
+def test_picture_that_is_looked_at_is_not_overwritten(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (place / "photo.png").write_bytes(b"mine")
+    (place / "run").mkdir()
+    save_config(smoke(), place / "run" / "config.json")
+    words = ("perceive", "photo.png", "--checkpoint", "run", "--out", "./photo.png")
+    assert "would overwrite what is looked at" in refusal(capsys, *words)
+    assert (place / "photo.png").read_bytes() == b"mine"
 
 
 def test_second_driver_of_a_run_is_refused(place: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,21 +7,8 @@ from typing import Any
 
 import pytest
 
-from slotfilm_dist.config import (
-    EncoderConfig,
-    EnvConfig,
-    LrConfig,
-    ObsConfig,
-    RewardWeights,
-    RunConfig,
-    SacConfig,
-    changed_fields,
-    config_hash,
-    from_dict,
-    load_config,
-    save_config,
-    to_dict,
-)
+from slotfilm_dist.config import EncoderConfig, EnvConfig, LrConfig, ObsConfig, RewardWeights, RunConfig, SacConfig
+from slotfilm_dist.config_files import changed_fields, config_hash, from_dict, load_config, save_config, to_dict
 from slotfilm_dist.presets import PRESETS
 
 
@@ -60,8 +47,8 @@ def with_value(path: str, value: Any) -> dict[str, Any]:
         ("sac.hidden", []),
         ("sac.hidden", [256, 0]),
         ("sac.log_std_min", 3.0),
-        ("replay.min_steps", 2_000_000),
-        ("schedule.random_steps", 2_000_000),
+        ("replay.min_steps", 1_200_000),
+        ("schedule.random_steps", 1_200_000),
         ("schedule.updates_per_step", 0.0),
         ("evaluation.seed", 5),
         ("evaluation.episodes", 0),
@@ -129,6 +116,13 @@ def test_corrupt_file_is_refused_by_its_name(tmp_path: Path, content: str) -> No
     path.write_text(content)
     with pytest.raises(ValueError, match=r"config\.json"):
         load_config(path)
+
+
+def test_file_of_an_older_version_with_a_field_that_nothing_read_is_taken(tmp_path: Path) -> None:
+    values = to_dict(RunConfig())
+    values["sac"]["train_heads"] = False
+    (tmp_path / "config.json").write_text(json.dumps(values))
+    assert load_config(tmp_path / "config.json") == RunConfig()
 
 
 def test_bytes_that_are_no_text_and_a_missing_file_are_refused(tmp_path: Path) -> None:

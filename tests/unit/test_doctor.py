@@ -88,6 +88,13 @@ def test_memory_that_is_too_small_names_what_is_needed() -> None:
     assert "6 GB" in check_memory(3.0).fix
 
 
+def test_machine_that_is_full_is_told_what_workers_would_do() -> None:
+    assert check_memory(24.0, 0.5).status == "ok"
+    full = check_memory(24.0, 0.95)
+    assert (full.status, full.found) == ("warn", "24.0 GiB, 95% in use")
+    assert "runtime.max_memory_share" in full.fix
+
+
 def test_open_files_are_judged_by_what_the_limit_can_be_raised_to() -> None:
     assert check_open_files(1024, 524288).status == "ok"
     assert check_open_files(1024, resource.RLIM_INFINITY).status == "ok"

@@ -1,6 +1,7 @@
 """The phases of a run, driven on a backend that only counts."""
 
 import io
+import json
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -13,7 +14,8 @@ from filelock import FileLock
 from rich.console import Console
 
 from slotfilm_dist.backend import Player, TrainReport
-from slotfilm_dist.config import RunConfig, load_config
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config_files import load_config
 from slotfilm_dist.envs.reward import NUM_INPUTS, TERMS
 from slotfilm_dist.messages import EpisodeSummary, TransitionBlock
 from slotfilm_dist.pipeline import Pipeline
@@ -99,7 +101,7 @@ class CountingBackend:
     def _report(self) -> TrainReport:
         return TrainReport(env_steps=self.env_steps, updates=self.env_steps, metrics={}, episodes=())
 
-    def play(self, player: Player, seeds: Sequence[int]) -> Iterator[EpisodeSummary]:
+    def play(self, player: Player, seeds: Sequence[int], should_stop: Callable[[], bool]) -> Iterator[EpisodeSummary]:
         self.calls.append(f"play {player} {seeds[0]}+{len(seeds)}")
         for seed in seeds:
             if self._during_play:
@@ -154,6 +156,20 @@ def test_second_run_takes_the_data_that_are_there_and_a_finished_run_only_evalua
     again = CountingBackend(config_of())
     execute(tmp_path, again)
     assert again.calls == ["load agent", "play random 10000000+2", "play agent 10000000+2"]
+
+
+def test_finished_run_with_a_larger_budget_trains_on_before_it_is_evaluated(tmp_path: Path) -> None:
+    execute(tmp_path, CountingBackend(config_of()))
+    longer = config_of()
+    longer = replace(longer, schedule=replace(longer.schedule, total_steps=480))
+    again = CountingBackend(longer)
+    again.env_steps = 400
+    said = io.StringIO()
+    execute(tmp_path, again, progress=Progress(Console(file=said, width=400)))
+    assert again.calls == ["resume", "train 440", "train 480", "play random 10000000+2", "play agent 10000000+2"]
+    assert "goes on at 400 of now 480 steps" in said.getvalue()
+    final = json.loads((tmp_path / "run" / "evaluation" / "final.json").read_text())
+    assert final["env_steps"] == 480
 
 
 class OtherRun(Progress):
@@ -239,7 +255,7 @@ def test_data_of_the_papers_reward_hold_its_inputs_and_others_the_reward(tmp_pat
 def test_evaluations_during_training_come_on_time_and_keep_the_best(tmp_path: Path) -> None:
     backend = CountingBackend(config_of(every_steps=100))
     execute(tmp_path, backend)
-    during = [i for i, call in enumerate(backend.calls) if call == "play agent 10000000+5"]
+    during = [i for i, call in enumerate(backend.calls) if call == "play agent 11000000+5"]
     assert [backend.calls[i - 1] for i in during] == ["train 280", "train 400"][:1]
     assert [saved["name"] for saved in backend.saved].count("best") == 1
 

@@ -49,3 +49,9 @@ def test_line_names_phase_share_values_and_time_left(monkeypatch: pytest.MonkeyP
 def test_nothing_to_do_and_too_much_done_show_a_full_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     lines = shown(monkeypatch, [(0, 0), (150, 100)])
     assert all("#" * 20 in line and "100%" in line for line in lines[1:3])
+
+
+def test_brackets_in_paths_and_errors_are_shown_as_they_are() -> None:
+    output = io.StringIO()
+    Progress(Console(file=output, width=200)).say("--resume '/runs/exp[gpu]/x': [enforce fail at a.cpp] [/]")
+    assert output.getvalue() == "--resume '/runs/exp[gpu]/x': [enforce fail at a.cpp] [/]\n"

@@ -1,6 +1,7 @@
 """Run directories: names, the lock, what may change on resuming."""
 
 import json
+import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -8,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from slotfilm_dist.config import RunConfig, load_config
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config_files import load_config
 from slotfilm_dist.messages import EpisodeSummary
-from slotfilm_dist.runs import RunDirectory, new_run_directory, resumed_config
+from slotfilm_dist.runs import RunDirectory, describe_machine, new_run_directory, resumed_config
 
 CONFIG = RunConfig()
 
@@ -70,6 +72,13 @@ def test_resuming_may_change_budgets_but_not_what_was_learned_from(tmp_path: Pat
     other = replace(CONFIG, seed=4, sac=replace(CONFIG.sac, gamma=0.9))
     with pytest.raises(ValueError, match=r"seed, sac\.gamma cannot change in a run that has begun"):
         resumed_config(tmp_path, CONFIG, other)
+    for changed in (
+        replace(CONFIG, runtime=replace(CONFIG.runtime, block_steps=64)),
+        replace(CONFIG, schedule=replace(CONFIG.schedule, updates_per_step=0.25)),
+        replace(CONFIG, schedule=replace(CONFIG.schedule, random_steps=240)),
+    ):
+        with pytest.raises(ValueError, match="cannot change in a run that has begun"):
+            resumed_config(tmp_path, CONFIG, changed)
 
 
 def test_damaged_status_counts_as_none(tmp_path: Path) -> None:
@@ -105,10 +114,40 @@ def test_room_of_a_run_counts_the_processes_that_it_started(tmp_path: Path) -> N
 
 def check_room(run: RunDirectory) -> None:
     alone = run.room()["run_memory_bytes"]
-    code = "import sys; held = bytearray(b'x') * 64_000_000; print(flush=True); sys.stdin.read()"
+    code = "import sys; held = bytearray(b'x') * 256_000_000; print(flush=True); sys.stdin.read()"
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
         assert child.stdout is not None
         child.stdout.readline()
         with_child = run.room()["run_memory_bytes"]
         child.communicate()
     assert with_child - alone > 64_000_000
+
+
+def test_episodes_that_a_full_disk_refuses_are_written_with_the_next(tmp_path: Path) -> None:
+    with RunDirectory(tmp_path / "run", CONFIG) as run:
+        log = run.path / "episodes.jsonl"
+        log.symlink_to("/dev/full")
+        run.log_episodes([some_episode(1)], 100, 0)
+        log.unlink()
+        run.log_episodes([some_episode(2)], 200, 5)
+        lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [(line["seed"], line["env_steps"], line["policy_version"]) for line in lines] == [(1, 100, 0), (2, 200, 5)]
+
+
+def some_episode(seed: int) -> EpisodeSummary:
+    return EpisodeSummary(
+        seed=seed,
+        length=3,
+        episode_return=1.0,
+        success_once=False,
+        success_at_end=False,
+        placed_at_end=False,
+        grasped_once=True,
+        reward_terms=(1.0,),
+    )
+
+
+def test_recorded_command_can_be_pasted(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ["slotfilm", "train", "quick", "--runs", "/home/o'brien/my runs"]
+    monkeypatch.setattr(sys, "argv", words)
+    assert shlex.split(describe_machine()["command"]) == words

@@ -53,6 +53,17 @@ def test_failed_checkpoint_is_told_counted_and_not_tried_again_at_once() -> None
     assert problem == ""
 
 
+def test_pauses_grow_so_that_there_is_time_to_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [1000.0]
+    monkeypatch.setattr("slotfilm_dist.saving.time.monotonic", lambda: now[0])
+    made, first = saver(FullDisk(100)), 1000.0
+    for _ in range(MAX_FAILED - 1):
+        made.save(report(120), {}, with_replay=False)
+        while not made.due(report(120)):
+            now[0] += 1.0
+    assert now[0] - first > 10 * 60
+
+
 def test_run_that_cannot_keep_what_it_learns_stops() -> None:
     made = saver(FullDisk(100))
     for _ in range(MAX_FAILED - 1):

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -53,14 +54,15 @@ class Published:
 
 
 class Waits:
-    """Notes what is waited for, and ends the wait when told to."""
+    """Notes what is waited for, does what it is told to then, and ends the wait when told to."""
 
-    def __init__(self, last: int = 1 << 30) -> None:
+    def __init__(self, last: int = 1 << 30, then: Callable[[], object] = lambda: None) -> None:
         self.texts: list[str] = []
-        self.last = last
+        self.last, self.then = last, then
 
     def __call__(self, waiting_for: str) -> None:
         self.texts.append(waiting_for)
+        self.then()
         if len(self.texts) >= self.last:
             raise StopIteration
 
@@ -186,11 +188,11 @@ def test_weights_go_stale_without_a_word_and_are_fresh_again_with_one() -> None:
 
 
 def test_policy_pauses_while_its_weights_are_stale_and_names_the_hub(caplog: pytest.LogCaptureFixture) -> None:
-    hub, waits = Answering(), Waits()
+    hub = Answering()
+    waits = Waits(then=hub.answers.set)
     following = FollowingPolicy(Recorder(), hub, waits, max_staleness_s=0.3)
     assert following.await_weights(10.0)
     hub.answers.clear()
-    threading.Timer(1.0, hub.answers.set).start()
     until(lambda: following.act(SEEN, NO_VISUAL) is not None and waits.texts)
     assert "the hub: no word for" in waits.texts[0]
     assert "runtime.max_staleness_s = 0.3" in waits.texts[0]

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from slotfilm_dist.cluster import inference
 from slotfilm_dist.cluster.acting import WeightLink
 from slotfilm_dist.cluster.central_policy import CentralPolicy
 from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
 from slotfilm_dist.cluster.inference import InferenceServer
-from slotfilm_dist.cluster.messages import AgentSetup, InferenceAnswer, InferenceRequest
+from slotfilm_dist.cluster.messages import AgentSetup, InferenceAnswer, InferenceRequest, InferenceStatus
 from slotfilm_dist.cluster.worker import build_policy
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.envs.toy import ACTION_DIM, ToyEnv
@@ -99,13 +100,18 @@ def test_transitions_equal_those_of_a_workers_own_inference(variant: str) -> Non
     assert (there.policy_version, there.backbone_hash) == (4, here.backbone_hash)
 
 
-def test_workers_are_computed_together_and_get_their_own_answers() -> None:
+def test_workers_are_computed_together_and_get_their_own_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inference, "ACTIVE_S", 60.0)
     config = config_of("slotfilm")
     setup, snapshot = agent_of(config)
     server = InferenceServer(build_policy(config, setup, SEED), Weights(snapshot), deadline_s=0.5)
     blocks: dict[int, TransitionBlock] = {}
+    before: list[InferenceStatus] = []
+    all_active = threading.Barrier(3, action=lambda: before.append(server.status()))
 
     def work(worker_id: int) -> None:
+        central(server, worker_id).visual(ToyEnv(config, camera=True).reset([0]))
+        all_active.wait(60)
         blocks[worker_id] = collect(config, central(server, worker_id), worker_id)
 
     threads = [threading.Thread(target=work, args=(worker_id,)) for worker_id in range(3)]
@@ -115,7 +121,9 @@ def test_workers_are_computed_together_and_get_their_own_answers() -> None:
         thread.join(60)
     status = server.status()
     server.close()
-    assert status.num_steps / status.num_batches > 2
+    num_steps, num_batches = (getattr(status, n) - getattr(before[0], n) for n in ("num_steps", "num_batches"))
+    assert num_steps / num_batches > 2
+    assert len(blocks) == 3
     for worker_id, block in blocks.items():
         alone = collect(config, own(config, setup, snapshot), worker_id)
         # A larger product may round differently in the last digit.
@@ -123,7 +131,8 @@ def test_workers_are_computed_together_and_get_their_own_answers() -> None:
         np.testing.assert_allclose(block.action, alone.action, atol=2e-3)
 
 
-def test_partial_batch_is_computed_when_its_deadline_is_over() -> None:
+def test_partial_batch_is_computed_when_its_deadline_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inference, "ACTIVE_S", 60.0)
     config = config_of("state_only")
     setup, snapshot = agent_of(config)
     server = InferenceServer(build_policy(config, setup, SEED), Weights(snapshot), deadline_s=0.05)

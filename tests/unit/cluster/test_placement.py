@@ -7,6 +7,7 @@ import pytest
 from slotfilm_dist.cluster.placement import (
     STATE_RESOURCE,
     WORKER_RESOURCE,
+    check_grown,
     infers_centrally,
     num_roles_that_fit,
     place,
@@ -75,3 +76,17 @@ def test_nodes_are_asked_for_by_their_resource_only_while_one_offers_it() -> Non
     nodes = [{"CPU": 2.0}, {"CPU": 2.0, WORKER_RESOURCE: 1.0}]
     assert list(place(nodes, WORKER_RESOURCE)) == [WORKER_RESOURCE]
     assert place(nodes[:1], WORKER_RESOURCE) == {}
+
+
+@pytest.mark.parametrize(
+    ("nodes", "sentence"),
+    [
+        ([{"memory": 1e9}], "no node of this Ray cluster has cores yet"),
+        ([{"memory": 1e9}, {"CPU": 16.0, WORKER_RESOURCE: 1.0}], "replay and learner would live on nodes that may go"),
+    ],
+)
+def test_cluster_whose_nodes_have_yet_to_join_is_refused(nodes: list[dict[str, float]], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        check_grown(nodes)
+    check_grown([*nodes, {"CPU": 4.0, STATE_RESOURCE: 1.0}])
+    check_grown([*nodes, {"CPU": 4.0}])

@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import pytest
 
-from slotfilm_dist.cluster.messages import HubStatus, InferenceStatus, LearnerStatus, WorkerBeat
+from slotfilm_dist.cluster.messages import HubStatus, InferenceStatus, LearnerStatus, ShardBeat, WorkerBeat
 from slotfilm_dist.cluster.reporting import Reporter, WorkerMetrics
 from slotfilm_dist.metrics import METRICS, check_names
 from slotfilm_dist.presets import smoke
+from slotfilm_dist.replay.ring import SampleTotals
+from slotfilm_dist.replay.shard import ShardStats
 
 
 def beat(**values: object) -> WorkerBeat:
@@ -72,7 +74,8 @@ def test_rates_and_shares_are_those_since_the_last_report() -> None:
     now[0] = 110.0
     later = LearnerStatus(updates=450, metrics={"learner_wait_s_total": 7.5}, waiting_for="")
     workers = [replace(workers[0], waited_s=6.0), replace(workers[1], waited_s=7.0)]
-    values = reporter.metrics(replace(HUB, env_steps=1_100), later, workers, [], {"crash": 2}, 1)
+    hub = replace(HUB, env_steps=1_100, steps_by_worker={0: 360, 1: 600})
+    values = reporter.metrics(hub, later, workers, [], {"crash": 2}, 1)
     check_names(values)
     assert values["worker_env_steps_per_s"] == pytest.approx(10.0)
     assert values["learner_updates_per_s"] == pytest.approx(5.0)
@@ -80,6 +83,51 @@ def test_rates_and_shares_are_those_since_the_last_report() -> None:
     assert values["learner_wait_share"] == pytest.approx(0.25)
     assert values["worker_least_share"] == pytest.approx(0.75)
     assert (values["worker_restarts_total/crash"], values["replay_restarts_total/crash"]) == (2, 1)
+
+
+def test_share_of_the_slowest_counts_only_what_the_same_workers_collect_together() -> None:
+    learner = LearnerStatus(updates=0, metrics={}, waiting_for="")
+    reporter, team = Reporter(smoke()), [beat(worker_id=0), beat(worker_id=1)]
+
+    def share(steps: dict[int, int], workers: list[WorkerBeat]) -> float | None:
+        hub = replace(HUB, steps_by_worker=steps)
+        return reporter.metrics(hub, learner, workers, [], {}, 0).get("worker_least_share")
+
+    assert share({0: 1000, 1: 1000}, team) is None
+    assert share({0: 1100, 1: 1050}, team) == pytest.approx(2 / 3)
+    more = [*team, beat(worker_id=2)]
+    assert share({0: 1200, 1: 1150}, more) is None
+    assert share({0: 1300, 1: 1250, 2: 100}, more) == pytest.approx(1.0)
+    assert share({0: 1400, 1: 1350, 2: 100}, team) is None
+
+
+def shard(starts: str, drawn: SampleTotals) -> ShardBeat:
+    stats = ShardStats(
+        num_steps=100,
+        capacity_steps=200,
+        inserted_steps=100,
+        inserted_blocks=10,
+        duplicate_blocks=0,
+        missing_blocks=0,
+        ring_bytes=1,
+        drawn=drawn,
+    )
+    return ShardBeat(stats=stats, starts=starts, restored_steps=0)
+
+
+def test_ages_are_those_of_what_was_drawn_since_the_last_report() -> None:
+    learner, reporter = LearnerStatus(updates=0, metrics={}, waiting_for=""), Reporter(smoke())
+
+    def ages(updates: int, *shards: ShardBeat) -> tuple[float | None, float | None]:
+        values = reporter.metrics(replace(HUB, updates=updates), learner, [], shards, {}, 0)
+        return values.get("replay_sample_age_steps"), values.get("replay_sample_age_updates")
+
+    old = SampleTotals(num_steps=1000, age_steps=5000, policy_version=100_000)
+    assert ages(400, shard("a", old)) == (None, None)
+    new = SampleTotals(num_steps=1100, age_steps=5000 + 100 * 7, policy_version=100_000 + 100 * 380)
+    assert ages(420, shard("a", new)) == (7.0, 40.0)
+    again = shard("b", old)  # the shard's process was replaced and took its sums from a snapshot
+    assert ages(430, again) == (None, None)
 
 
 def test_lateness_of_weights_is_the_median_over_workers() -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from slotfilm_dist.cluster.actors import CONCURRENCY, HubActor
+from slotfilm_dist.cluster.failures import RoleSilentError
 from slotfilm_dist.cluster.hub import ASKS_PER_S, LEAST_RETRY_S, WAITING_ROOM, Hub
 from slotfilm_dist.cluster.messages import BlockKey, BlockNotice, StepGrant
 from slotfilm_dist.cluster.sender import BlockSender
@@ -92,6 +93,7 @@ class Crowded:
 
     def __init__(self, times: int) -> None:
         self.times, self.asked_at = times, list[float]()
+        self.confirmed: list[BlockKey] = []
 
     def admit_steps(self, notice: BlockNotice, stored: Iterable[BlockKey], timeout_s: float) -> StepGrant:
         self.asked_at.append(time.monotonic())
@@ -99,14 +101,18 @@ class Crowded:
         return StepGrant(granted=granted, waited_s=0.0, waiting_for="", finished=False, retry_s=0.0 if granted else 0.2)
 
     def confirm(self, stored: Iterable[BlockKey]) -> None:
-        pass
+        self.confirmed += stored
 
 
 class Store:
-    def __init__(self) -> None:
+    def __init__(self, silent: int = 0) -> None:
         self.blocks: list[TransitionBlock] = []
+        self.silent = silent
 
     def insert(self, block: TransitionBlock) -> bool:
+        if self.silent:
+            self.silent -= 1
+            raise RoleSilentError("shard 0", "a block to be stored", 5.0)
         self.blocks.append(block)
         return True
 
@@ -114,10 +120,8 @@ class Store:
         return 0
 
 
-def test_sender_that_is_sent_away_asks_again_only_after_that_time() -> None:
-    hub, store = Crowded(times=2), Store()
-    sender = BlockSender(hub, store)
-    block = TransitionBlock(
+def one_block() -> TransitionBlock:
+    return TransitionBlock(
         worker_id=0,
         incarnation=0,
         sequence=0,
@@ -134,8 +138,25 @@ def test_sender_that_is_sent_away_asks_again_only_after_that_time() -> None:
         truncated=np.zeros(1, bool),
         is_step=np.ones(1, bool),
     )
+
+
+def test_sender_that_is_sent_away_asks_again_only_after_that_time() -> None:
+    hub, store = Crowded(times=2), Store()
+    sender = BlockSender(hub, store)
+    block = one_block()
     assert sender.offer(block, 10.0)
     until(lambda: store.blocks)
     sender.close()
     assert len(hub.asked_at) == 3
     assert min(np.diff(hub.asked_at)) >= 0.2
+
+
+def test_block_that_its_shard_took_only_after_the_last_grant_is_confirmed() -> None:
+    hub, store = Crowded(times=0), Store(silent=3)
+    sender = BlockSender(hub, store)
+    assert sender.offer(one_block(), 10.0)
+    until(lambda: hub.asked_at)
+    sender.finished = True  # as the hub says to whoever asks after the run's last step
+    until(lambda: store.blocks)
+    sender.close()
+    assert hub.confirmed == [BlockKey(worker_id=0, incarnation=0, sequence=0)]

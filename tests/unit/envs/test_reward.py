@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from math import exp
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,6 @@ from slotfilm_dist.envs.reward import (
     TERMS,
     RewardInputs,
     RewardTerms,
-    max_reward,
     num_reward_inputs,
     progress,
     reward_inputs,
@@ -21,6 +21,7 @@ from slotfilm_dist.envs.reward import (
     rewards_of,
     shaped,
 )
+from slotfilm_dist.envs.reward_bounds import largest_terms, max_reward
 from slotfilm_dist.envs.scene import SceneState
 
 DEFAULT = RewardConfig()
@@ -173,10 +174,27 @@ def test_success_is_placed_and_still_and_released_where_asked() -> None:
 
 @pytest.mark.parametrize(
     ("fields", "bound"),
-    [({}, 1.0), ({"near_form": "inverse"}, (10 + 1 + 20 + 1 + 1) / 6), ({"normalize": "none"}, 6.0)],
+    [
+        ({}, 1.0),
+        ({"near_form": "inverse"}, (10 + 1 + 20 + 1 + 1) / 6),
+        ({"normalize": "none"}, 6.0),
+        # Just beyond delta, at 0.02 m, exp(-alpha d) is more than so low a cap.
+        ({"near_form": "inverse", "near_cap": 0.1, "alpha": 5.0, "delta_m": 0.02}, (3 * exp(-0.1) + 3) / 6),
+    ],
 )
 def test_upper_bound_of_the_reward(fields: dict[str, Any], bound: float) -> None:
-    assert max_reward(replace(DEFAULT, **fields)) == pytest.approx(bound)
+    config = replace(DEFAULT, **fields)
+    assert max_reward(config) == pytest.approx(bound)
+    assert sum(largest_terms(config).values()) == pytest.approx(bound)
+
+
+@pytest.mark.parametrize("form", ["bounded", "inverse", "exp_only"])
+def test_components_come_up_to_their_largest_values_and_no_further(form: str) -> None:
+    config = replace(DEFAULT, near_form=form)
+    near, far = terms(config, to_tcp=0.0, to_goal=0.0, grasped=True), terms(config, to_goal=9.0, grasped=True)
+    found = {name: float(getattr(near, name)) for name in ("reach", "grasp", "place", "static")}
+    found["post_grasp"] = float(far.post_grasp)
+    assert found == pytest.approx(largest_terms(config), rel=1e-4)
 
 
 def drawn_inputs(count: int) -> RewardInputs:

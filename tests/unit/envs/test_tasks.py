@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from slotfilm_dist.config import EnvConfig, RunConfig
-from slotfilm_dist.envs.tasks import TASKS, adapt_config, task_named
+from slotfilm_dist.envs.tasks import TASKS, adapt_config, check_goal, task_named
 from slotfilm_dist.variants import apply_variant
 
 
@@ -54,5 +54,7 @@ def test_object_poses_are_recounted_when_the_number_of_objects_changes() -> None
 
 def test_goal_query_needs_a_task_with_a_goal() -> None:
     config = config_of("StackCube-v1")
-    with pytest.raises(ValueError, match=r"encoder\.goal.*StackCube-v1 has no goal"):
-        adapt_config(replace(config, encoder=replace(config.encoder, goal=True)))
+    check_goal(config)
+    with pytest.raises(ValueError, match=r"encoder\.goal = True: StackCube-v1 has no goal.*leave --encoder\.goal"):
+        check_goal(replace(config, encoder=replace(config.encoder, goal=True)))
+    check_goal(apply_variant("slotfilm_goal", config_of("PickCube-v1")))

@@ -6,7 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from slotfilm_dist.config import RunConfig, save_config
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config_files import save_config
 from slotfilm_dist.evaluation.record import save_evaluation, summarize
 from slotfilm_dist.evaluation.video import RolloutFrame, write_film_strip, write_video
 from slotfilm_dist.messages import EpisodeSummary

@@ -40,12 +40,34 @@ def test_grasp_that_slipped_is_not_the_one_shown() -> None:
 def test_object_pushed_into_place_without_a_grasp_is_no_placement() -> None:
     moments = episode(101, grasped=range(40, 60), placed=range(0, 30))
     names = [name for _, name in key_steps(moments)]
-    assert names == ["reach", "grasp", "transport", "step 100"]
+    assert names == ["reach", "grasp", "transport", "step 75", "step 100"]
 
 
 def test_dropped_object_is_not_called_held() -> None:
     moments = episode(101, grasped=range(20, 80), placed=range(60, 80))
     assert key_steps(moments)[-1] == (100, "step 100")
+
+
+@pytest.mark.parametrize(
+    ("grasped", "placed", "expected"),
+    [
+        ([10], [], [(5, "reach"), (10, "grasp"), (32, "step 32"), (55, "step 55"), (100, "step 100")]),
+        (range(50, 101), range(51, 101), [(0, "step 0"), (25, "reach"), (50, "grasp"), (51, "place"), (100, "hold")]),
+        ([100], [], [(0, "step 0"), (25, "step 25"), (50, "reach"), (75, "step 75"), (100, "grasp")]),
+        ([50], [50], [(0, "step 0"), (25, "reach"), (50, "grasp"), (75, "step 75"), (100, "step 100")]),
+        (range(20, 101), [100], [(10, "reach"), (20, "grasp"), (40, "step 40"), (60, "transport"), (100, "place")]),
+    ],
+    ids=["dropped at once", "placed at once", "grasped at the end", "grasped and placed at once", "placed at the end"],
+)
+def test_moments_that_coincide_or_are_missing_leave_five_panels(grasped, placed, expected) -> None:
+    assert key_steps(episode(101, grasped, placed)) == expected
+
+
+def test_transport_shows_the_object_held() -> None:
+    moments = episode(101, grasped=[*range(10, 20), *range(80, 90)])
+    steps = {name: step for step, name in key_steps(moments)}
+    assert steps["grasp"] == 10
+    assert moments[steps["transport"]].grasped
 
 
 def test_episode_without_grasp_is_evenly_spaced_and_named_by_step() -> None:

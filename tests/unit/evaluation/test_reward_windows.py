@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slotfilm_dist.config import RunConfig, save_config
+from slotfilm_dist.config import RewardConfig, RunConfig
+from slotfilm_dist.config_files import save_config
 from slotfilm_dist.evaluation.record import RunRecord, read_run
 from slotfilm_dist.evaluation.reward_windows import component_rows, draw_components, moving_average, window_rows
 
@@ -16,8 +17,10 @@ EARLY = (6.0, 1.0, 2.0, 2.0, 3.0)
 LATE = (2.0, 5.0, 6.0, 0.0, 1.0)
 
 
-def run_with(folder: Path, episodes: list[tuple[int, tuple[float, ...]]]) -> RunRecord:
-    base = RunConfig()
+def run_with(
+    folder: Path, episodes: list[tuple[int, tuple[float, ...]]], num_random: int = 0, reward: RewardConfig | None = None
+) -> RunRecord:
+    base = RunConfig(reward=reward or RewardConfig())
     schedule = dataclasses.replace(base.schedule, total_steps=1200, random_steps=100)
     save_config(
         dataclasses.replace(base, schedule=schedule, replay=dataclasses.replace(base.replay, min_steps=100)),
@@ -30,11 +33,14 @@ def run_with(folder: Path, episodes: list[tuple[int, tuple[float, ...]]]) -> Run
         "success_at_end": False,
         "placed_at_end": False,
         "grasped_once": False,
-        "policy_version": 0,
     }
     text = [
-        json.dumps(line | {"env_steps": steps, "episode_return": sum(terms), "reward_terms": terms})
-        for steps, terms in episodes
+        json.dumps(
+            line
+            | {"env_steps": steps, "episode_return": sum(terms), "reward_terms": terms}
+            | {"policy_version": -1 if i < num_random else 0}
+        )
+        for i, (steps, terms) in enumerate(episodes)
     ]
     (folder / "episodes.jsonl").write_text("\n".join(text))
     return read_run(folder)
@@ -54,6 +60,17 @@ def test_shares_of_each_window_add_up_over_the_tables_three_components(tmp_path:
     assert (rows["late", "table_2", "place"]["from_step"], rows["late", "table_2", "place"]["to_step"]) == (800, 1200)
 
 
+def test_episodes_of_the_random_policy_count_nowhere(tmp_path: Path) -> None:
+    (tmp_path / "with").mkdir()
+    own = [(400, EARLY), (900, LATE)]
+    record = run_with(tmp_path / "with", [(100, LATE), *own], num_random=1)
+    without = run_with(tmp_path, own)
+    assert window_rows(record) == window_rows(without)
+    assert component_rows(record) == component_rows(without)
+    with pytest.raises(ValueError, match="no training episode yet"):
+        window_rows(run_with(tmp_path, own, num_random=2))
+
+
 def test_components_are_divided_by_their_weights(tmp_path: Path) -> None:
     # Weights 1, 1, 2, 1, 1 divided by 6: a component at its largest gives 100 x weight / 6 in 100 steps.
     full = tuple(100 * w / 6 for w in (1, 1, 2, 1, 1))
@@ -61,6 +78,13 @@ def test_components_are_divided_by_their_weights(tmp_path: Path) -> None:
     for name in ("reach", "grasp", "place", "post_grasp", "static"):
         assert [row[name] for row in rows] == pytest.approx([1.0, 0.5])
     assert draw_components(rows, tmp_path / "c.png").stat().st_size > 5_000
+
+
+def test_capped_near_form_counts_in_the_largest_value(tmp_path: Path) -> None:
+    # The cap of 10 lifts reach and place to 10 and 20 sixths of a step.
+    full = tuple(100 * w / 6 for w in (10, 1, 20, 1, 1))
+    rows = component_rows(run_with(tmp_path, [(100, full)], reward=RewardConfig(near_form="inverse")))
+    assert [rows[0][name] for name in ("reach", "grasp", "place", "post_grasp", "static")] == pytest.approx([1.0] * 5)
 
 
 def test_moving_average_is_causal_and_starts_at_the_first_value() -> None:

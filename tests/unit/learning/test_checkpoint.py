@@ -171,6 +171,18 @@ def test_store_falls_back_to_an_older_checkpoint_and_says_why(tmp_path: Path) ->
     assert "updates-000000002" in found[1][0]
 
 
+def test_checkpoint_just_written_stays_and_those_that_the_run_went_back_behind_go(tmp_path: Path) -> None:
+    store = CheckpointStore(tmp_path, keep=1)
+    for number in (10, 20):
+        store.write(checkpoint(number), number)
+    flip_bit(tmp_path / "updates-000000020" / TENSORS, 100)
+    store.write(checkpoint(12), 12)
+    assert [path.name for path in tmp_path.iterdir()] == ["updates-000000012"]
+    found = store.read_last("abc")
+    assert found is not None
+    assert (found[0].values["updates"], found[1]) == (12, [])
+
+
 def test_store_without_checkpoints_gives_none_and_with_bad_ones_refuses(tmp_path: Path) -> None:
     store = CheckpointStore(tmp_path / "checkpoints", keep=2)
     assert store.read_last("abc") is None

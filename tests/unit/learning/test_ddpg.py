@@ -180,8 +180,9 @@ def test_workers_get_the_noise_with_the_weights() -> None:
 
 
 def test_noise_of_the_losses_is_clipped_and_actions_stay_in_range() -> None:
-    actor = DeterministicActor(4, 0, 7, feature_dim=4, hidden=(8,), generator=torch.Generator().manual_seed(0))
-    latent, noise = torch.randn(200, 4), torch.randn(200, 7) * 3
+    generator = torch.Generator().manual_seed(0)
+    actor = DeterministicActor(4, 0, 7, feature_dim=4, hidden=(8,), generator=generator)
+    latent, noise = torch.randn(200, 4, generator=generator), torch.randn(200, 7, generator=generator) * 3
     mode = actor.mode(latent)
     inside = mode.abs() < 0.6
     clipped = actor(latent, noise, 0.3)
@@ -269,6 +270,6 @@ def test_losses_that_are_not_finite_are_skipped_and_then_stop_the_learner() -> N
 def test_pixel_learner_needs_no_pretraining_and_stores_pictures() -> None:
     learner = Learner(config_of(), 7, torch.device("cpu"))
     learner.begin_rl(None)
-    assert not learner.needs_pretraining
+    assert not learner.config.pretrains
     schema = learner.schema()
     assert (schema.visual_kind, schema.visual_shape, schema.backbone_hash) == ("rgb", (SIZE, SIZE, 3), "")

@@ -1,5 +1,6 @@
 """The update as a CUDA graph against the plain one: on a CPU the same computation without a graph."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -146,6 +147,7 @@ def test_changed_rates_count_from_the_next_update(device: str) -> None:
     assert all(torch.equal(before[name], p) for name, p in learner.critic.named_parameters())
 
 
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++, a program of ops/test-packages.txt")
 def test_compiled_networks_update_the_same() -> None:
     config = RunConfig(
         encoder=EncoderConfig(backbone="random"),

@@ -338,6 +338,22 @@ def test_saved_learner_continues_bit_for_bit(encoder: EncoderConfig) -> None:
     assert not torch.equal(expected["actor.network.weights.0"], saved["tensors"]["actor.network.weights.0"])
 
 
+def test_end_to_end_learner_continues_with_moments_that_lie_in_memory_as_their_weights_do() -> None:
+    config = replace(SEEING, backbone="random")
+    rng = np.random.default_rng(0)
+    pictures = rng.integers(0, 256, (4, 2, 128, 128, 3), dtype=np.uint8)
+    batches = [batch_of(config, size=2, seed=i, visual=pictures[i], next_visual=pictures[i + 1]) for i in range(3)]
+    straight = build(config, end_to_end=True)
+    for batch in batches[:2]:
+        straight.update(batch)
+    resumed = build(config, seed=99, end_to_end=True)
+    resumed.load(straight.save())
+    for learner in (straight, resumed):
+        learner.update(batches[2])
+    expected, found = tensors(straight), tensors(resumed)
+    assert not [name for name in expected if not torch.equal(expected[name], found[name])]
+
+
 @pytest.mark.parametrize(
     "name", ["actor.network.weights.0", "critic_optimiser.0.exp_avg", "log_temperature", "noise_state"]
 )

@@ -38,11 +38,11 @@ def test_attention_has_the_parameters_of_the_paper() -> None:
 
 @pytest.mark.parametrize("num_slots", [1, 2, 4])
 def test_folded_attention_equals_plain_attention(num_slots: int) -> None:
-    folded, plain = pair()
-    ours, our_attention = folded(*inputs(num_slots))
-    theirs, their_attention = plain(*inputs(num_slots))
-    torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=0)
-    torch.testing.assert_close(our_attention, their_attention, atol=1e-6, rtol=0)
+    folded, plain = pair(torch.float64)
+    ours, our_attention = folded(*inputs(num_slots, torch.float64))
+    theirs, their_attention = plain(*inputs(num_slots, torch.float64))
+    torch.testing.assert_close(ours, theirs, atol=1e-9, rtol=0)
+    torch.testing.assert_close(our_attention, their_attention, atol=1e-9, rtol=0)
 
 
 def test_folded_attention_has_the_gradients_of_plain_attention() -> None:
@@ -71,13 +71,13 @@ def test_pooled_output_is_the_mean_over_slots_with_its_gradients() -> None:
 
 
 def test_query_of_each_sample_attends_as_in_plain_attention() -> None:
-    folded, plain = pair()
-    _, tokens, code = inputs()
-    queries = torch.randn(BATCH, DIM, generator=torch.Generator().manual_seed(3))
+    folded, plain = pair(torch.float64)
+    _, tokens, code = inputs(dtype=torch.float64)
+    queries = torch.randn(BATCH, DIM, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     ours = folded.one_query_each(queries, tokens, code)
     for sample in range(BATCH):
         theirs, _ = plain(queries[sample : sample + 1], tokens[sample : sample + 1], code)
-        torch.testing.assert_close(ours[sample], theirs[0, 0], atol=1e-6, rtol=0)
+        torch.testing.assert_close(ours[sample], theirs[0, 0], atol=1e-9, rtol=0)
 
 
 def test_slots_that_compete_share_every_token_and_keep_the_key_bias() -> None:

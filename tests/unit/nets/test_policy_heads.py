@@ -97,7 +97,7 @@ def test_ensemble_equals_separate_networks_of_linear_layers() -> None:
 
 def test_frozen_critic_passes_gradient_to_its_input_only() -> None:
     critic = TwinCritic(3, 2, (4,), layer_norm=True, generator=generator())
-    latent, action = torch.randn(5, 3, requires_grad=True), torch.randn(5, 2, requires_grad=True)
+    latent, action = (torch.randn(5, size, generator=generator(size)).requires_grad_() for size in (3, 2))
     frozen = critic(latent, action, frozen=True)
     assert torch.equal(frozen, critic(latent, action))
     frozen.sum().backward()

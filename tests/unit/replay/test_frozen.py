@@ -59,7 +59,7 @@ def test_snapshot_written_while_others_insert_and_draw_is_of_the_instant_it_bega
         nonlocal inserted
         while not ended.is_set():
             with lock:
-                shard.insert(make_block(500 * (50 + inserted), 500, sequence=50 + inserted))
+                shard.insert(make_block(500 * (50 + inserted % 1000), 500, sequence=50 + inserted))
                 shard.sample(1, 8)
             inserted += 1
 

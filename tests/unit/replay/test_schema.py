@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slotfilm_dist.config import from_dict, to_dict
+from slotfilm_dist.config_files import from_dict, to_dict
 from slotfilm_dist.replay.schema import ReplaySchema
 
 

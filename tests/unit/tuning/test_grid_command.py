@@ -1,6 +1,7 @@
 """What `slotfilm grid` says before it starts anything."""
 
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -84,3 +85,10 @@ def test_mistake_is_refused_before_anything_starts(words: list[str], message: st
     with pytest.raises(ValueError, match=message):
         main(["smoke", "--dry-run", *words])
     assert list(tmp_path.iterdir()) == []
+
+
+def test_recorded_command_can_be_pasted(tmp_path: Path) -> None:
+    command = ("grid", "quick", "--runs", "/home/o'brien/my runs")
+    write_grid_file(tmp_path, smoke(), command)
+    (recorded,) = json.loads((tmp_path / "grid.json").read_text())["commands"]
+    assert tuple(shlex.split(recorded)) == ("slotfilm", *command)

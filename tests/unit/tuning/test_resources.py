@@ -37,11 +37,20 @@ def test_trial_on_ray_has_a_bundle_for_each_role_and_its_memory_in_that_of_the_d
     assert sum(bundle.get("memory", 0.0) for bundle in given.bundles) == pytest.approx(given.memory_bytes, rel=0.01)
 
 
+def test_gpu_that_is_asked_for_is_never_left_away() -> None:
+    """A node with a GPU may join after the grid began; where none can, the trial is refused."""
+    given = job_resources(job(), LAPTOP, gpus_per_trial=0.25)
+    assert given.num_gpus == 0.25
+    assert job_resources(job(), LAPTOP).num_gpus == 0
+    with pytest.raises(ValueError, match=r"0\.25 GPUs"):
+        check_fits("job", given, LAPTOP)
+
+
 def test_nodes_for_workers_and_for_state_are_asked_for_where_there_are_any() -> None:
     driver, learner, *others = job_resources(job(), SPOT).bundles
-    # Hub, learner, central inference and one shard take 0.001 each; two workers may share any bundle.
-    assert driver["slotfilm_state"] == 0.004
-    assert learner == {"CPU": 1.0, "slotfilm_state": 0.004}
+    # Hub, learner and one shard take 0.001 each; two workers may share any bundle.
+    assert driver["slotfilm_state"] == 0.003
+    assert learner == {"CPU": 1.0, "slotfilm_state": 0.003}
     assert [bundle["slotfilm_worker"] for bundle in others] == [0.002] * 3
     assert not [bundle for bundle in others if "slotfilm_state" in bundle]
     assert not [bundle for bundle in job_resources(job(), HOST).bundles if {*bundle} - {"CPU", "GPU", "memory"}]
@@ -69,9 +78,10 @@ def test_learner_waits_for_no_core_where_it_must_live() -> None:
     assert placement_in_group(job().config, anywhere).learner_cpus == 1.0
 
 
-def test_central_inference_is_a_role_more() -> None:
-    assert job_resources(job(inference="worker"), HOST).num_roles == 4
-    assert job_resources(job(inference="central"), HOST).num_roles == 5
+def test_nothing_is_kept_for_central_inference_which_no_trial_has() -> None:
+    given = job_resources(job(inference="central"), HOST)
+    assert given == job_resources(job(inference="worker"), HOST)
+    assert fit_to_resources(job(inference="central").config, given).runtime.inference == "worker"
 
 
 def test_trial_in_one_process_has_one_bundle() -> None:

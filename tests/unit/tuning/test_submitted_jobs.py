@@ -36,6 +36,19 @@ def test_paper_begins_then_goes_on_then_rests(tmp_path: Path) -> None:
     assert words(given) == []
 
 
+def test_paper_of_another_variant_has_a_directory_of_its_own_and_goes_on(tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    places = ["--artifacts", str(tmp_path / "a")]
+    given = ["--runs", str(runs), *places, "--variant", "no_state"]
+    words = job("paper").words
+    run = runs / "paper-no_state-s0"
+    begun = ["train", "paper", "--variant", "no_state", "--seed", "0", "--runs", str(runs), "--name", run.name]
+    assert words(given) == [*begun, *places]
+    run.mkdir(parents=True)
+    (run / "config.json").touch()
+    assert words(given) == ["train", "--resume", str(run), *places]
+
+
 def test_paper_refuses_a_directory_that_ray_deletes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as refusal:
         job("paper").words(["--runs", "runs", "--artifacts", str(tmp_path)])

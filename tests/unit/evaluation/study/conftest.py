@@ -5,7 +5,8 @@ import json
 
 import pytest
 
-from slotfilm_dist.config import RunConfig, save_config
+from slotfilm_dist.config import RunConfig
+from slotfilm_dist.config_files import save_config
 from slotfilm_dist.evaluation.record import save_evaluation, summarize
 from slotfilm_dist.messages import EpisodeSummary
 from slotfilm_dist.runs import RunDirectory

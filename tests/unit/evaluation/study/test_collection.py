@@ -1,9 +1,11 @@
 import dataclasses
+import json
 
 import pytest
 
-from slotfilm_dist.config import load_config, save_config
-from slotfilm_dist.evaluation.study.collection import Trial, collect_study
+from slotfilm_dist.config_files import load_config, save_config
+from slotfilm_dist.evaluation.study.collection import Grid, Trial, collect_study
+from slotfilm_dist.tuning.ledger import directory_of
 
 
 def test_runs_are_ordered_by_variant_and_seed(tmp_path, write_small_run):
@@ -83,7 +85,18 @@ def test_the_same_variant_and_seed_counts_once(tmp_path, write_small_run):
     write_small_run(tmp_path / "b", "slotfilm", 0)
     study = collect_study(tmp_path)
     assert len(study.runs) == 1
-    assert "is there twice" in study.left_out[0]
+    assert study.left_out == ("b/slotfilm-s0: slotfilm with seed 0 is there twice; a/slotfilm-s0 counts.",)
+
+
+@pytest.mark.parametrize("over", [True, False])
+def test_an_unfinished_run_whose_seed_is_there_already_is_named(tmp_path, write_small_run, over):
+    write_small_run(tmp_path / "a", "slotfilm", 0, over=False)
+    write_small_run(tmp_path / "b", "slotfilm", 0, over=over)
+    study = collect_study(tmp_path)
+    assert (len(study.runs), len(study.unfinished)) == ((1, 0) if over else (0, 1))
+    kept, left_out = ("b", "a") if over else ("a", "b")
+    expected = f"{left_out}/slotfilm-s0: slotfilm with seed 0 is there twice; {kept}/slotfilm-s0 counts."
+    assert study.left_out == (expected,)
 
 
 def test_a_damaged_config_is_named(tmp_path, write_small_run):
@@ -96,12 +109,14 @@ def test_a_damaged_config_is_named(tmp_path, write_small_run):
 
 def test_trials_that_failed_or_never_began_are_named(tmp_path, write_small_run):
     write_small_run(tmp_path, "slotfilm", 0)
-    trials = [
-        Trial(key="slotfilm-s0", kind="trial", variant="slotfilm", seed=0, state="done"),
-        Trial(key="cnn-s0-ab", kind="trial", variant="cnn", seed=0, state="failed", error="ValueError: boom"),
-        Trial(key="drq-s0-cd", kind="trial", variant="drq", seed=0, state="waiting"),
-    ]
-    assert collect_study(tmp_path, trials).left_out == (
+    trials = (
+        Trial(path=tmp_path / "slotfilm-s0", kind="trial", variant="slotfilm", seed=0, state="done"),
+        Trial(
+            path=tmp_path / "cnn-s0-ab", kind="trial", variant="cnn", seed=0, state="failed", error="ValueError: boom"
+        ),
+        Trial(path=tmp_path / "drq-s0-cd", kind="trial", variant="drq", seed=0, state="waiting"),
+    )
+    assert collect_study(tmp_path, [Grid(path=tmp_path, trials=trials, commands=())]).left_out == (
         "cnn-s0-ab: failed, ValueError: boom.",
         "drq-s0-cd: waiting, not begun.",
     )
@@ -109,11 +124,50 @@ def test_trials_that_failed_or_never_began_are_named(tmp_path, write_small_run):
 
 def test_a_grid_s_job_that_made_an_encoder_is_no_run_of_the_study(tmp_path, write_small_run):
     write_small_run(tmp_path, "slotfilm", 0)
-    write_small_run(tmp_path, "slotfilm", 1, pretrained=True).rename(tmp_path / "encoder-ab")
-    trials = [Trial(key="encoder-ab", kind="encoder", variant="slotfilm", seed=1, state="done")]
-    study = collect_study(tmp_path, trials)
+    (tmp_path / "making").mkdir()
+    maker = directory_of(tmp_path, "encoder-ab", "encoder")
+    write_small_run(tmp_path, "slotfilm", 1, pretrained=True).rename(maker)
+    trials = (Trial(path=maker, kind="encoder", variant="slotfilm", seed=1, state="done"),)
+    study = collect_study(tmp_path, [Grid(path=tmp_path, trials=trials, commands=())])
     assert [run.seed for run in study.runs] == [0]
-    assert [record.run_dir.name for record in study.makers] == ["encoder-ab"]
+    assert [record.run_dir for record in study.makers] == [maker]
+    assert study.grid_of(study.makers[0]) is study.grids[0]
+
+
+def test_jobs_of_two_grids_may_have_the_same_names(tmp_path, write_small_run):
+    write_small_run(tmp_path / "a", "slotfilm", 0, pretrained=True).rename(tmp_path / "a" / "same")
+    write_small_run(tmp_path / "b", "slotfilm", 1).rename(tmp_path / "b" / "same")
+    first, second = (
+        Grid(
+            path=tmp_path / name,
+            trials=(Trial(path=tmp_path / name / "same", kind=kind, variant="slotfilm", seed=seed, state="done"),),
+            commands=(f"slotfilm grid {name}",),
+        )
+        for name, kind, seed in (("a", "encoder", 0), ("b", "trial", 1))
+    )
+    study = collect_study(tmp_path, [first, second])
+    assert [run.path for run in study.runs] == [tmp_path / "b" / "same"]
+    assert [record.run_dir for record in study.makers] == [tmp_path / "a" / "same"]
+    assert study.left_out == ()
+    assert study.commands_of([*study.makers, study.runs[0].record]) == ("slotfilm grid a", "slotfilm grid b")
+
+
+def test_what_a_grid_of_other_settings_made_is_left_out(tmp_path, write_small_run, small_base):
+    write_small_run(tmp_path / "a", "slotfilm", 0)
+    other = dataclasses.replace(small_base, sac=dataclasses.replace(small_base.sac, gamma=0.5))
+    write_small_run(tmp_path / "b", "slotfilm", 0, base=other, pretrained=True).rename(tmp_path / "b" / "encoder-ab")
+    trials = (Trial(path=tmp_path / "b" / "encoder-ab", kind="encoder", variant="slotfilm", seed=0, state="done"),)
+    study = collect_study(tmp_path, [Grid(path=tmp_path / "b", trials=trials, commands=())])
+    assert study.makers == ()
+    assert study.left_out[0].startswith("b/encoder-ab: other settings than the rest (sac.gamma)")
+
+
+def test_a_run_beside_a_grid_has_a_command_of_its_own(tmp_path, write_small_run):
+    write_small_run(tmp_path / "grid", "slotfilm", 0)
+    alone = write_small_run(tmp_path, "slotfilm", 1)
+    study = collect_study(tmp_path, [Grid(path=tmp_path / "grid", trials=(), commands=("slotfilm grid",))])
+    own = json.loads((alone / "versions.json").read_text())["command"]
+    assert study.commands_of(run.record for run in study.runs) == ("slotfilm grid", own)
 
 
 def test_a_folder_without_runs_is_refused(tmp_path):

@@ -8,7 +8,6 @@ from slotfilm_dist.evaluation.study.estimates import (
     curve_band,
     estimate_improvement,
     estimate_iqm,
-    estimate_pooled_iqm,
     held_curve,
     improvement,
     iqm,
@@ -91,15 +90,14 @@ def test_interval_holds_the_value_and_lies_within_the_scores():
     assert estimate.num_seeds == 4
 
 
-def test_pooled_mean_is_over_all_seeds_of_all_variants():
-    estimate = estimate_pooled_iqm([[1.0, 2.0], [3.0, 100.0]])
-    assert estimate.value == 2.5
-    assert estimate.num_seeds == 4
-
-
 def test_area_weighs_an_episode_by_what_it_lasted():
     steps, values = np.array([10.0, 40.0, 50.0]), np.array([1.0, 2.0, 9.0])
     assert area_under_curve(steps, values, 0, 50) == pytest.approx((10 * 1 + 30 * 2 + 10 * 9) / 50)
+
+
+def test_area_counts_every_episode_of_workers_that_ended_between_two_reports():
+    steps, values = np.repeat([100.0, 200.0, 300.0], 3), np.tile([0.0, 15.0, 15.0], 3)
+    assert area_under_curve(steps, values, 0, 300) == pytest.approx(10)
 
 
 def test_area_of_unequal_runs_is_cut_to_the_range_given():

@@ -1,6 +1,8 @@
+import json
+
 import pytest
 
-from slotfilm_dist.evaluation.study.collection import collect_study
+from slotfilm_dist.evaluation.study.collection import Grid, collect_study
 from slotfilm_dist.evaluation.study.how_to import measure_command, train_commands
 
 
@@ -12,16 +14,34 @@ def test_missing_variants_are_trained_like_the_run_at_hand(tmp_path, write_small
 
 
 @pytest.mark.parametrize(
+    ("recorded", "common"),
+    [
+        ("slotfilm train --name foo quick", "slotfilm train quick"),
+        ("slotfilm train --name=foo quick", "slotfilm train quick"),
+        ("slotfilm train quick --seed 3 --variant", "slotfilm train quick"),
+        ("slotfilm train quick --runs '/a b/c'", "slotfilm train quick --runs '/a b/c'"),
+        ("slotfilm train quick --runs /home/o'brien/runs", """slotfilm train quick --runs '/home/o'"'"'brien/runs'"""),
+    ],
+)
+def test_recorded_command_keeps_all_but_the_options_of_one_run(tmp_path, write_small_run, recorded, common):
+    path = write_small_run(tmp_path, "slotfilm", 0)
+    (path / "versions.json").write_text(json.dumps({"command": recorded}))
+    assert train_commands(collect_study(tmp_path), ["cnn"]) == (f"{common} --variant cnn --seed 0",)
+
+
+@pytest.mark.parametrize(
     "given",
     [
         "slotfilm grid quick --only slotfilm,no_state --seeds 2",
         "slotfilm grid quick --only slotfilm --only no_state --seeds 2 --json",
         "slotfilm grid quick --exclude=cnn --seeds 2",
+        "slotfilm grid --only slotfilm quick --seeds 2",
     ],
 )
 def test_missing_variants_of_a_grid_are_trained_by_its_own_command(tmp_path, write_small_run, given):
     write_small_run(tmp_path, "slotfilm", 0)
-    study = collect_study(tmp_path, commands=["slotfilm grid quick --seeds 1", given])
+    grid = Grid(path=tmp_path, trials=(), commands=("slotfilm grid quick --seeds 1", given))
+    study = collect_study(tmp_path, [grid])
     assert train_commands(study, ["cnn", "drq"]) == ("slotfilm grid quick --seeds 2 --only cnn,drq",)
 
 

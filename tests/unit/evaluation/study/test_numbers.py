@@ -43,7 +43,7 @@ def test_area_of_a_shorter_variant_is_compared_over_its_own_steps(tmp_path, writ
     write_small_run(tmp_path, "drqv2", 0)
     numbers = by_variant(tmp_path)
     assert numbers["slotfilm"].runs[0].until == 1500
-    assert numbers["drqv2"].runs[0].until == 1000
+    assert numbers["drqv2"].runs[0].until == 1050
     # Up to step 1000 drqv2 has reached its level already, and slotfilm is still a step of 0.1 an episode below.
     assert numbers["drqv2"].area_over_proposed.value == 1.0
 

@@ -1,4 +1,5 @@
 import csv
+import dataclasses
 import json
 import re
 from html.parser import HTMLParser
@@ -187,12 +188,20 @@ def test_a_study_of_unfinished_runs_says_that_there_are_no_numbers(tmp_path, wri
     assert not (tmp_path / "report" / "tables" / "variants.csv").exists()
 
 
+def write_grid(grid, command, *records):
+    """What `slotfilm grid` leaves of itself in its directory."""
+    (grid / "ledger").mkdir(parents=True)
+    (grid / "grid.json").write_text(json.dumps({"settings": {}, "commands": [command]}))
+    for record in records:
+        (grid / "ledger" / f"{record['key']}.json").write_text(json.dumps(record))
+
+
+FAILED = {"key": "cnn-s0-ab", "kind": "trial", "variant": "cnn", "seed": 0, "state": "failed", "error": "boom"}
+
+
 def test_command_reports_a_run_or_a_study(tmp_path, write_small_run, capsys):
     path = write_small_run(tmp_path / "grid", "state_only", 0)
-    (tmp_path / "grid" / "grid.json").write_text(json.dumps({"settings": {}, "commands": ["slotfilm grid smoke"]}))
-    (tmp_path / "grid" / "ledger").mkdir()
-    record = {"key": "cnn-s0-ab", "kind": "trial", "variant": "cnn", "seed": 0, "state": "failed", "error": "boom"}
-    (tmp_path / "grid" / "ledger" / "cnn-s0-ab.json").write_text(json.dumps(record))
+    write_grid(tmp_path / "grid", "slotfilm grid smoke", FAILED)
     assert main([str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"page": str(path / "report.html")}
     assert main([str(tmp_path / "grid"), "--json", "--out", str(tmp_path / "out")]) == 0
@@ -203,7 +212,41 @@ def test_command_reports_a_run_or_a_study(tmp_path, write_small_run, capsys):
     assert missing["commands"] == ["slotfilm grid smoke --only slotfilm,end_to_end"]
 
 
+def test_folder_of_grids_is_read_with_their_ledgers_and_commands(tmp_path, write_small_run, capsys):
+    maker = write_small_run(tmp_path / "runs" / "first" / "making", "slotfilm", 1, pretrained=True)
+    maker.rename(maker.with_name("encoder-ab"))
+    made = {"key": "encoder-ab", "kind": "encoder", "variant": "slotfilm", "seed": 1, "state": "done"}
+    write_grid(tmp_path / "runs" / "first", "slotfilm grid one", FAILED, made)
+    write_small_run(tmp_path / "runs" / "second", "slotfilm", 0)
+    write_grid(tmp_path / "runs" / "second", "slotfilm grid two")
+    assert main([str(tmp_path / "runs"), "--json", "--out", str(tmp_path / "out")]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert [row["run"] for row in values["runs"]] == ["slotfilm-s0"]
+    assert values["left_out"] == ["first/cnn-s0-ab: failed, boom."]
+    items = {entry["item"]: entry for entry in values["items"]}
+    assert items["Figure 3"]["shown"]
+    assert items["Figure 16"]["missing"][0]["commands"] == ["slotfilm grid two --only end_to_end"]
+
+
 def test_command_refuses_a_folder_for_the_page_of_a_run(tmp_path, write_small_run):
     path = write_small_run(tmp_path, "state_only", 0)
     with pytest.raises(ValueError, match="leave --out away"):
         main([str(path), "--out", str(tmp_path / "out")])
+
+
+def test_commands_of_a_folder_with_a_blank_can_be_pasted(tmp_path, write_small_run):
+    folder = tmp_path / "my runs"
+    film = write_small_run(folder, "slotfilm", 0) / "film_strips" / "agent-7.png"
+    film.parent.mkdir()
+    Image.fromarray(np.zeros((40, 60, 3), dtype=np.uint8)).save(film)
+    text = write_study(collect_study(folder), tmp_path / "out").page.with_suffix(".md").read_text(encoding="utf-8")
+    assert f"slotfilm evaluate '{folder}/slotfilm-s0' --what film_strips --seed 7 --episodes 1" in text
+    assert f"slotfilm cost --json > '{folder}/cost.json'" in text
+
+
+@pytest.mark.parametrize(("form", "highest"), [("bounded", "500"), ("inverse", "2 750")])
+def test_highest_return_follows_from_the_reward(tmp_path, write_small_run, small_base, form, highest):
+    reward = dataclasses.replace(small_base.reward, near_form=form)
+    write_small_run(tmp_path, "slotfilm", 0, base=dataclasses.replace(small_base, reward=reward))
+    text = write_study(collect_study(tmp_path), tmp_path / "report").page.with_suffix(".md").read_text(encoding="utf-8")
+    assert f"At most {highest} in an episode of 50 steps" in text.replace("\N{NO-BREAK SPACE}", " ")
