@@ -32,6 +32,7 @@ from slotfilm_dist.learning.frames import PretrainFrames
 from slotfilm_dist.learning.graphed_sac import GraphedSac
 from slotfilm_dist.learning.pretrain import Pretrainer
 from slotfilm_dist.learning.sac import SacLearner
+from slotfilm_dist.learning.state_scale import state_scale
 from slotfilm_dist.messages import SampleBatch, TransitionBlock, WeightSnapshot
 from slotfilm_dist.nets.agent import AgentEncoder, build_encoder
 from slotfilm_dist.nets.encoder import SlotFusionEncoder
@@ -43,8 +44,6 @@ from slotfilm_dist.seeds import Role, role_number, role_seed
 
 RlLearner = SacLearner | DdpgLearner
 
-SMALLEST_STD = 1e-2
-"""Least deviation that the state is divided by: a field that barely moves at random may matter later."""
 LOSSES_EVERY = 10
 """Pre-training steps between readings of the losses, for each of which the learner waits for the GPU."""
 ENCODE_ROWS = 256
@@ -187,11 +186,9 @@ class Learner:
             self.encoder.freeze_backbone()
         self.encoder.eval()
         if config.obs.normalize_state and dataset is not None:
-            rows = dataset.proprio[:STATE_ROWS]
-            mean, std = rows.mean(axis=0, dtype=np.float64), rows.std(axis=0, dtype=np.float64)
+            mean, std = state_scale(config.obs, dataset.proprio[:STATE_ROWS])
             self.encoder.set_state_statistics(
-                torch.from_numpy(mean.astype(np.float32)).to(self.device),
-                torch.from_numpy(np.maximum(std, SMALLEST_STD).astype(np.float32)).to(self.device),
+                torch.from_numpy(mean).to(self.device), torch.from_numpy(std).to(self.device)
             )
         self._pretrainer = None
         self._rl = build_rl(config, self.encoder, self._action_dim, self.device)
