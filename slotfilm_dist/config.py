@@ -233,6 +233,8 @@ class EncoderConfig:
     """Initial ResNet-18 weights: torchvision's ImageNet download, a file, or random. Never falls back silently."""
     backbone_path: str = ""
     """ResNet-18 weights for `backbone = path`: .safetensors, or a torch state dict (loaded with weights_only)."""
+    backbone_sha256: str = ""
+    """SHA-256 of that file: filled in by the run that can read it, so that another file of this name is told apart."""
     frozen_precision: Precision = "float32"
     """Arithmetic of the frozen backbone on a CPU: bfloat16 takes two thirds of the time where the processor has it, and
     the tokens lose their third digit; `auto` takes it there and float32 elsewhere."""
@@ -272,17 +274,13 @@ class EncoderConfig:
             f"must divide encoder.feature_dim = {self.feature_dim}",
         )
         check(
-            self.feature_dim % 2 == 0,
-            "encoder.feature_dim",
-            self.feature_dim,
-            "must be even: half codes the row, half the column",
+            self.feature_dim % 2 == 0, "encoder.feature_dim", self.feature_dim, "must be even, for the positional code"
         )
-        check(
-            self.backbone != "path" or bool(self.backbone_path),
-            "encoder.backbone_path",
-            self.backbone_path,
-            "encoder.backbone = 'path' needs a file",
-        )
+        wants_file = self.backbone == "path" and not self.backbone_path
+        check(not wants_file, "encoder.backbone_path", self.backbone_path, "encoder.backbone = 'path' needs a file")
+        check(self.uses_image or not self.goal, "encoder.goal", self.goal, "encoder.fusion = 'state_only' has no slots")
+        bias = self.goal_out_of_view_bias
+        check(bias <= 0, "encoder.goal_out_of_view_bias", bias, "must be 0 or less: it closes the gate to the goal")
 
     @property
     def learns_from_pixels(self) -> bool:

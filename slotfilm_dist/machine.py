@@ -3,6 +3,7 @@
 import contextlib
 import math
 import os
+import shutil
 from pathlib import Path
 
 GIB = 1024**3
@@ -35,6 +36,11 @@ def has_bfloat16(processors: Path = Path("/proc/cpuinfo")) -> bool:
 def takes_bfloat16(precision: str) -> bool:
     """Whether a precision of `float32`, `bfloat16` or `auto` means bfloat16 on this processor."""
     return precision == "bfloat16" or (precision == "auto" and has_bfloat16())
+
+
+def has_c_compiler() -> bool:
+    """Whether there is one of the C compilers that Triton looks for."""
+    return any(shutil.which(name) for name in ("cc", "gcc", "clang"))
 
 
 def usable_memory_bytes(control_groups: Path = CONTROL_GROUPS) -> int:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from slotfilm_dist.commands.options import FIELDS_NOTE, Parser, build_config, check_weights_file, parse_with_fields
+from slotfilm_dist.commands.options import FIELDS_NOTE, Parser, build_config, parse_with_fields, with_weights_file
 from slotfilm_dist.config import CheckpointConfig, RunConfig, RuntimeConfig
 from slotfilm_dist.config_files import changed_fields, config_hash
 from slotfilm_dist.presets import PRESETS, preset_named
@@ -40,15 +40,13 @@ def main(arguments: Sequence[str]) -> int:
         raise ValueError(f"--retries {options.retries}: must be 0 or more")
     if options.max_concurrent < 0:
         raise ValueError(f"--max-concurrent {options.max_concurrent}: must be 0 or more; 0 is as many as fit")
-    base = build_config(options.preset, "slotfilm", fields, show_fields=options.fields)
-    check_weights_file(base)
+    base = with_weights_file(build_config(options.preset, "slotfilm", fields, show_fields=options.fields))
 
     from slotfilm_dist.tuning.grid_file import write_grid_file
-    from slotfilm_dist.tuning.jobs import build_jobs, build_trials, select_variants
+    from slotfilm_dist.tuning.jobs import build_jobs, build_trials
     from slotfilm_dist.tuning.ledger import Ledger, held_by_one_driver
 
-    variants = select_variants(_names(options.only), _names(options.exclude))
-    jobs = build_jobs(build_trials(base, variants, options.seeds))
+    jobs = build_jobs(build_trials(base, _variants(options, base), options.seeds))
     grid = _directory(options, base)
     if options.dry_run:
         return _dry_run(options, fields, grid, jobs)
@@ -101,6 +99,24 @@ def _parser() -> Parser:
 
 def _names(given: Sequence[str]) -> list[str]:
     return [name for words in given for name in words.replace(",", " ").split()]
+
+
+def _variants(options: "argparse.Namespace", base: RunConfig) -> list[str]:
+    """The grid's variants; those that the task makes meaningless are left out and named.
+
+    Raises:
+        ValueError: one of those was asked for by name, or nothing is left.
+    """
+    from slotfilm_dist.tuning.jobs import meaningless_variants, select_variants
+
+    chosen = select_variants(_names(options.only), _names(options.exclude))
+    reasons = meaningless_variants(base, chosen)
+    told = ", ".join(f"{name} ({reason})" for name, reason in reasons.items())
+    if reasons and (options.only or len(reasons) == len(chosen)):
+        raise ValueError(f"--only {told}: leave it away")
+    if reasons:
+        print(f"Left out: {told}", file=sys.stderr)
+    return [name for name in chosen if name not in reasons]
 
 
 def _settings(base: RunConfig) -> RunConfig:

@@ -9,13 +9,13 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import NoReturn
 
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.config_files import from_dict, to_dict
 from slotfilm_dist.presets import PRESETS, preset_named
 from slotfilm_dist.variants import VARIANTS, apply_variant
+from slotfilm_dist.weights_file import weights_file_sha256
 
 TOP_FIELDS = tuple(field.name for field in dataclasses.fields(RunConfig))
 FIELDS_NOTE = "Every field of the config is an option too, as in --sac.temperature 0.2; `--fields` lists them all."
@@ -128,18 +128,18 @@ def change_fields(base: RunConfig, fields: Sequence[str]) -> RunConfig:
     return from_dict(RunConfig, to_dict(changed))
 
 
-def check_weights_file(config: RunConfig) -> None:
-    """Find out before anything heavy is imported or started whether the file of initial weights is there.
+def with_weights_file(config: RunConfig) -> RunConfig:
+    """The config with the SHA-256 of its file of initial weights, read before anything heavy is imported or started.
 
     On the cluster of `RAY_ADDRESS` the file lies where the learner runs, which looks for it itself.
 
     Raises:
-        ValueError: there is no such file.
+        ValueError: the file cannot be read, or is not the one that `encoder.backbone_sha256` names.
     """
     encoder = config.encoder
-    wanted = encoder.backbone == "path" and encoder.uses_image and not os.environ.get("RAY_ADDRESS")
-    if wanted and not Path(encoder.backbone_path).is_file():
-        raise ValueError(f"encoder.backbone_path = {encoder.backbone_path!r}: there is no such file")
+    if encoder.backbone != "path" or not encoder.uses_image or os.environ.get("RAY_ADDRESS"):
+        return config
+    return replace(config, encoder=replace(encoder, backbone_sha256=weights_file_sha256(encoder)))
 
 
 def _refusal(fields: Sequence[str], shown: str) -> str:

@@ -13,8 +13,8 @@ from slotfilm_dist.commands.options import (
     add_config_options,
     build_config,
     change_fields,
-    check_weights_file,
     parse_with_fields,
+    with_weights_file,
 )
 from slotfilm_dist.commands.scale import AUTO, workers_wanted
 from slotfilm_dist.config import RunConfig
@@ -57,9 +57,10 @@ def main(arguments: Sequence[str]) -> int:
         _refuse_beside_resume(options)
         path = Path(options.resume)
         config = _resumed_config(path, fields)
+        with_weights_file(config)  # only looks: what names the run's checkpoints stays
     else:
         preset = options.preset or DEFAULT_PRESET
-        config = build_config(preset, options.variant, fields, show_fields=options.fields)
+        config = with_weights_file(build_config(preset, options.variant, fields, show_fields=options.fields))
         path = new_run_directory(Path(options.runs or "runs"), config, preset, options.name)
     return _execute(path, config, Path(options.artifacts), as_json=options.json)
 
@@ -88,8 +89,6 @@ def _resumed_config(path: Path, fields: Sequence[str]) -> RunConfig:
 
 
 def _execute(path: Path, config: RunConfig, artifacts: Path, *, as_json: bool) -> int:
-    check_weights_file(config)
-
     from slotfilm_dist.driver import drive
 
     with contextlib.redirect_stdout(sys.stderr):  # Ray's messages keep out of --json

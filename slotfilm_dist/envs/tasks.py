@@ -70,8 +70,5 @@ def adapt_config(config: RunConfig) -> RunConfig:
 def check_goal(config: RunConfig) -> None:
     """Raise ``ValueError`` if the encoder queries a goal that the task does not have."""
     task = task_named(config.env.task)
-    want = (
-        f"{task.env_id} has no goal point to query; leave --encoder.goal and the variant slotfilm_goal away "
-        "(of a grid: --exclude slotfilm_goal)"
-    )
+    want = f"{task.env_id} has no goal point to query; leave --encoder.goal and the variant slotfilm_goal away"
     check(not config.encoder.goal or bool(task.goal), "encoder.goal", config.encoder.goal, want)

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from slotfilm_dist.config import TEMPERATURE_FIELDS, RunConfig, SacConfig
+from slotfilm_dist.config import TEMPERATURE_FIELDS, RunConfig, SacConfig, check
 from slotfilm_dist.config_files import config_hash
 from slotfilm_dist.envs.reward import rewards_of
 from slotfilm_dist.learning.checkpoint import Checkpoint, plain_tensors
@@ -33,6 +33,7 @@ from slotfilm_dist.learning.graphed_sac import GraphedSac
 from slotfilm_dist.learning.pretrain import Pretrainer
 from slotfilm_dist.learning.sac import SacLearner
 from slotfilm_dist.learning.state_scale import state_scale
+from slotfilm_dist.machine import has_c_compiler
 from slotfilm_dist.messages import SampleBatch, TransitionBlock, WeightSnapshot
 from slotfilm_dist.nets.agent import AgentEncoder, build_encoder
 from slotfilm_dist.nets.encoder import SlotFusionEncoder
@@ -86,13 +87,16 @@ class Learner:
         fetch_weights: fill the backbone as `encoder.backbone` asks; False where a checkpoint fills it right after.
 
     Raises:
-        ValueError: the backbone's weights cannot be had.
+        ValueError: the backbone's weights cannot be had, or updates cannot be compiled here.
     """
 
     def __init__(self, config: RunConfig, action_dim: int, device: torch.device, *, fetch_weights: bool = True) -> None:
         self.config = config
         self.device = device
         self._action_dim = action_dim
+        compiles = config.runtime.compiled and device.type == "cuda"
+        needs = "needs a C compiler where the learner runs, for instance the package gcc; or leave it away"
+        check(not compiles or has_c_compiler(), "runtime.compiled", config.runtime.compiled, needs)
         self.encoder: AgentEncoder = build_encoder(config, fetch_weights=fetch_weights).to(device)
         self._pretrainer: Pretrainer | None = None
         self._rl: RlLearner | None = None
@@ -182,6 +186,8 @@ class Learner:
     def begin_rl(self, dataset: FrameDataset | None) -> None:
         """Freeze the backbone unless it is trained end to end, take the state's statistics, and build the RL half."""
         config = self.config
+        fusion = getattr(self.encoder, "fusion", None)
+        assert fusion is None or fusion.is_identity(), "pre-training must leave FiLM at zero"
         if not config.sac.end_to_end:
             self.encoder.freeze_backbone()
         self.encoder.eval()

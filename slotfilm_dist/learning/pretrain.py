@@ -34,7 +34,6 @@ class Pretrainer:
             metrics = pretrainer.step()
             if pretrainer.num_steps % config.eval_every == 0:
                 quality = pretrainer.evaluate()
-        pretrainer.finish()
 
     With `pretrain.train_backbone = none` the backbone runs once over all frames, in a fixed eval mode, and its float16
     features stay in memory (32 KB per 128 x 128 frame); every step afterwards is cheap. The batch of step i depends on
@@ -161,13 +160,6 @@ class Pretrainer:
             image_size=self._image_size,
             matched_visibility=self.network.matched_visibility,
         )
-
-    def finish(self) -> None:
-        """Freeze backbone and projection and leave the encoder in eval mode, ready for RL."""
-        assert self.encoder.fusion is not None
-        assert self.encoder.fusion.is_identity(), "pre-training must leave FiLM at zero"
-        self.encoder.freeze_backbone()
-        self.encoder.eval()
 
     def save(self) -> dict[str, Any]:
         """The perception's weights, Adam's moments and the step, as nested dicts of arrays and scalars.

@@ -14,6 +14,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from slotfilm_dist.config import EncoderConfig
+from slotfilm_dist.weights_file import weights_file_sha256
 
 FEATURE_CHANNELS = 256
 """Channels of the feature map."""
@@ -107,6 +108,7 @@ def load_initial_weights(backbone: Backbone, config: EncoderConfig) -> None:
     if config.backbone == "imagenet":
         _load(backbone, _download_imagenet(), "torchvision's ImageNet weights")
     elif config.backbone == "path":
+        weights_file_sha256(config)  # refuses another file than the run began with
         _load(backbone, _read(Path(config.backbone_path)), f"encoder.backbone_path = {config.backbone_path!r}")
 
 
@@ -140,8 +142,6 @@ def _download_imagenet() -> Mapping[str, Any]:
 def _read(path: Path) -> Mapping[str, Any]:
     """The tensors of a .safetensors or torch file; never runs code that the file brings."""
     where = f"encoder.backbone_path = {str(path)!r}"
-    if not path.is_file():
-        raise ValueError(f"{where}: there is no such file")
     try:
         if path.suffix == ".safetensors":
             return load_file(path)

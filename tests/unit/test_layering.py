@@ -23,6 +23,7 @@ LEVELS: dict[str, int] = {
     "contracts": 0,
     "metrics": 0,
     "atomic": 0,
+    "weights_file": 0,
     "machine": 0,
     "dashboards": 0,
     "backend": 0,

@@ -41,11 +41,6 @@ def build(vis_head: str = "pooled", **fields: Any) -> Pretrainer:
     return Pretrainer(encoder, discs(), config, seed=0)
 
 
-def film(pretrainer: Pretrainer) -> torch.nn.Linear:
-    assert pretrainer.encoder.fusion is not None
-    return pretrainer.encoder.fusion.film
-
-
 @pytest.mark.parametrize("vis_head", ["pooled", "matched"])
 def test_pretraining_beats_predicting_the_mean_on_held_out_episodes(vis_head: str) -> None:
     pretrainer = build(vis_head)
@@ -91,20 +86,11 @@ def test_backbone_that_is_not_trained_stays_as_it_was() -> None:
     assert {"perception.projection.weight", "perception.slots", "perception.row_code"} <= changed
 
 
-def test_finish_leaves_an_encoder_that_is_ready_for_rl() -> None:
+def test_pretraining_leaves_film_at_zero() -> None:
     pretrainer = build()
     pretrainer.step()
-    pretrainer.finish()
-    assert pretrainer.encoder.visual_kind == "tokens"
-    assert not pretrainer.encoder.training
-    assert not film(pretrainer).weight.any()
-
-
-def test_finish_refuses_film_that_has_moved() -> None:
-    pretrainer = build()
-    torch.nn.init.ones_(film(pretrainer).bias)
-    with pytest.raises(AssertionError, match="FiLM"):
-        pretrainer.finish()
+    assert pretrainer.encoder.fusion is not None
+    assert pretrainer.encoder.fusion.is_identity()
 
 
 @pytest.mark.parametrize("train_backbone", ["none", "all"])

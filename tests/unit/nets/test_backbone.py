@@ -12,6 +12,7 @@ from torchvision.models import ResNet18_Weights, resnet18
 
 from slotfilm_dist.config import EncoderConfig
 from slotfilm_dist.nets.backbone import Backbone, load_initial_weights, weights_hash
+from slotfilm_dist.weights_file import weights_file_sha256
 
 
 def drawn(seed: int) -> Backbone:
@@ -115,6 +116,17 @@ class Bomb:
 
     def __reduce__(self) -> tuple[object, tuple[object, ...]]:
         return (Path.touch, (self.path,))
+
+
+def test_other_weights_of_the_same_name_are_told_apart_and_refused(tmp_path: Path) -> None:
+    path = tmp_path / "resnet.safetensors"
+    save_file(whole_resnet(), path)
+    config = EncoderConfig(backbone="path", backbone_path=str(path))
+    config = dataclasses.replace(config, backbone_sha256=weights_file_sha256(config))
+    load_initial_weights(drawn(7), config)
+    save_file({name: value * 2 for name, value in whole_resnet().items()}, path)
+    with pytest.raises(ValueError, match=r"is not the file that encoder\.backbone_sha256 names"):
+        load_initial_weights(drawn(7), config)
 
 
 def test_file_that_brings_code_is_refused_without_running_it(tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def test_encoder_has_the_parameters_of_the_paper(goal: bool, expected: int) -> N
 
 @pytest.mark.parametrize("fusion", FUSIONS)
 def test_parameter_groups_hold_every_parameter_once(fusion: str) -> None:
-    encoder = build(fusion=fusion, goal=True)
+    encoder = build(fusion=fusion, goal=fusion != "state_only")
     groups = (
         encoder.fusion_parameters(),
         encoder.gate_parameters(),
@@ -214,7 +214,7 @@ def test_perception_has_one_position_per_slot(vis_head: str, num_slots: int, num
 
 @pytest.mark.parametrize("fusion", FUSIONS)
 def test_acting_state_makes_a_worker_act_as_the_learner(fusion: str) -> None:
-    learner, worker = build(fusion=fusion, goal=True), build(fusion=fusion, goal=True)
+    learner, worker = (build(fusion=fusion, goal=fusion != "state_only") for _ in range(2))
     with torch.no_grad():
         for parameter in (*learner.fusion_parameters(), *learner.gate_parameters()):
             parameter.add_(0.1)

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from slotfilm_dist.presets import smoke
-from slotfilm_dist.tuning.jobs import Job, build_jobs, build_trials, select_variants
+from slotfilm_dist.tuning.jobs import Job, build_jobs, build_trials, meaningless_variants, select_variants
 from slotfilm_dist.variants import VARIANTS
 
 
@@ -21,6 +21,14 @@ def test_unknown_variant_is_refused_with_the_nearest(only: list[str], exclude: l
 def test_grid_without_a_variant_is_refused() -> None:
     with pytest.raises(ValueError, match="leaves no variant"):
         select_variants(["cnn"], ["cnn"])
+
+
+def test_on_a_stock_task_the_grid_has_no_variant_that_would_repeat_the_proposed_agent() -> None:
+    everything = select_variants([], [])
+    on_stackcube = replace(smoke(), env=replace(smoke().env, task="StackCube-v1"))
+    own_reward = {"varpi_1", "varpi_10", "no_static", "alpha_5", "alpha_15"}
+    assert meaningless_variants(on_stackcube, everything).keys() == own_reward | {"slotfilm_goal"}
+    assert meaningless_variants(smoke(), everything) == {}
 
 
 def test_trials_come_seed_by_seed_from_the_bases_seed_on() -> None:
