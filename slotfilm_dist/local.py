@@ -218,16 +218,16 @@ class LocalBackend:
         episodes: list[tuple[EpisodeSummary, int]] = []
         reported = time.monotonic()
         began_steps, began_updates = limiter.env_steps, learner.updates
-        while limiter.env_steps < config.schedule.total_steps:
-            left = config.schedule.total_steps - limiter.env_steps
-            block = self._collect(min(config.runtime.block_steps, left))
-            is_new = self._store.insert(block)
-            assert is_new, "blocks of one process are numbered"
-            limiter.try_insert(block.num_steps)
-            episodes += [(episode, block.policy_version) for episode in block.episodes]
-            while limiter.updates_owed():  # also those that a return to a checkpoint has lost
+        while (left := config.schedule.total_steps - limiter.env_steps) > 0 or limiter.updates_owed():
+            if limiter.updates_owed():  # also those that a return to a checkpoint has lost
                 self._update(self._store.sample(1, config.sac.batch_size)[0])
-            self._policy.version = learner.updates
+            else:
+                self._policy.version = learner.updates
+                block = self._collect(min(config.runtime.block_steps, left))
+                is_new = self._store.insert(block)
+                assert is_new, "blocks of one process are numbered"
+                limiter.try_insert(block.num_steps)
+                episodes += [(episode, block.policy_version) for episode in block.episodes]
             now = time.monotonic()
             if now - reported >= REPORT_S:
                 elapsed = now - reported
@@ -240,7 +240,7 @@ class LocalBackend:
                 yield self._report(metrics, episodes)
                 episodes = []
                 reported, began_steps, began_updates = time.monotonic(), limiter.env_steps, learner.updates
-            if self._loop.at_episode_start and should_stop():
+            if self._loop.at_episode_start and not limiter.updates_owed() and should_stop():
                 break
         yield self._report(self._metrics(), episodes)
 
