@@ -1,14 +1,23 @@
 """What a run needs of the place where its roles live: one process, or a Ray cluster."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from slotfilm_dist.messages import EpisodeSummary, TransitionBlock
+from slotfilm_dist.messages import EpisodeSummary, TrainingEpisode, TransitionBlock
 
 Player = Literal["random", "expert", "agent"]
 """Who acts in an evaluation; `agent` is the learner's newest weights, acting deterministically."""
+
+
+IsDue = Callable[[int, int], bool]
+"""Whether something is due at these environment steps and updates."""
+
+
+def never_due(env_steps: int, updates: int) -> bool:
+    """Nothing is ever due."""
+    return False
 
 
 class RunFailedError(RuntimeError):
@@ -29,8 +38,10 @@ class TrainReport:
     """Updates so far."""
     metrics: Mapping[str, float]
     """Values by the metric catalogue's names."""
-    episodes: tuple[tuple[EpisodeSummary, int], ...] = field(default=())
-    """Training episodes that ended, each with the version of the weights that acted."""
+    episodes: tuple[TrainingEpisode, ...] = ()
+    """Training episodes that ended."""
+    settled: bool = True
+    """Evaluations and checkpoints may follow; in one process only where an episode starts and no update is owed."""
 
 
 @runtime_checkable
@@ -80,8 +91,14 @@ class Backend(Protocol):
         """
         ...
 
-    def train(self, should_stop: Callable[[], bool]) -> Iterator[TrainReport]:
-        """Train until the schedule's end, or until `should_stop`, reporting a few times a second."""
+    def train(self, should_stop: Callable[[], bool], is_due: IsDue = never_due) -> Iterator[TrainReport]:
+        """Train until the schedule's end, or until `should_stop`, reporting about once a second.
+
+        Args:
+            should_stop: asked many times a second.
+            is_due: whether an evaluation or a checkpoint is due; one process reports then, whatever the clock says,
+                so that they come at the same steps in every run of a seed.
+        """
         ...
 
     def play(self, player: Player, seeds: Sequence[int], should_stop: Callable[[], bool]) -> Iterator[EpisodeSummary]:

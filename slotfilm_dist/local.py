@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from slotfilm_dist.backend import Player, RunFailedError, TrainReport
+from slotfilm_dist.backend import IsDue, Player, RunFailedError, TrainReport, never_due
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.contracts import AdjustableEnv
 from slotfilm_dist.evaluation.rollouts import Recorder
@@ -29,7 +29,7 @@ from slotfilm_dist.learning.pretraining_files import continue_unfinished, save_f
 from slotfilm_dist.learning.recovery import Recovery
 from slotfilm_dist.local_envs import LocalEnvs, make_wrist_env
 from slotfilm_dist.machine import usable_cores, usable_memory_bytes
-from slotfilm_dist.messages import EpisodeSummary, SampleBatch, TransitionBlock
+from slotfilm_dist.messages import EpisodeSummary, SampleBatch, TrainingEpisode, TransitionBlock
 from slotfilm_dist.nets.agent import build_encoder
 from slotfilm_dist.policy import AgentPolicy, RandomPolicy
 from slotfilm_dist.rejection import BrokenEnvironmentError
@@ -212,10 +212,10 @@ class LocalBackend:
         self._learner.load_checkpoint(checkpoint)
         return int(checkpoint.values["limiter"]["env_steps"])
 
-    def train(self, should_stop: Callable[[], bool]) -> Iterator[TrainReport]:
+    def train(self, should_stop: Callable[[], bool], is_due: IsDue = never_due) -> Iterator[TrainReport]:
         """Collect and update in turn until the schedule's end; a stop takes effect where an episode ends."""
         config, learner, limiter = self._config, self._trained(), self._limiter
-        episodes: list[tuple[EpisodeSummary, int]] = []
+        episodes: list[TrainingEpisode] = []
         reported = time.monotonic()
         began_steps, began_updates = limiter.env_steps, learner.updates
         while (left := config.schedule.total_steps - limiter.env_steps) > 0 or limiter.updates_owed():
@@ -227,22 +227,23 @@ class LocalBackend:
                 is_new = self._store.insert(block)
                 assert is_new, "blocks of one process are numbered"
                 limiter.try_insert(block.num_steps)
-                episodes += [(episode, block.policy_version) for episode in block.episodes]
-            now = time.monotonic()
-            if now - reported >= REPORT_S:
-                elapsed = now - reported
+                where = {"policy_version": block.policy_version, "env_steps": limiter.env_steps}
+                episodes += [TrainingEpisode(summary=episode, **where) for episode in block.episodes]
+            settled = self._loop.at_episode_start and not limiter.updates_owed()
+            elapsed = time.monotonic() - reported
+            if elapsed >= REPORT_S or (settled and is_due(limiter.env_steps, learner.updates)):
                 metrics = self._metrics() | {
                     "worker_env_steps_per_s": (limiter.env_steps - began_steps) / elapsed,
                     "learner_updates_per_s": (learner.updates - began_updates) / elapsed,
                     "replay_stored_steps": self._store.num_steps(),
                     "limiter_ratio": limiter.ratio,
                 }
-                yield self._report(metrics, episodes)
+                yield self._report(metrics, episodes, settled)
                 episodes = []
                 reported, began_steps, began_updates = time.monotonic(), limiter.env_steps, learner.updates
-            if self._loop.at_episode_start and not limiter.updates_owed() and should_stop():
+            if settled and should_stop():
                 break
-        yield self._report(self._metrics(), episodes)
+        yield self._report(self._metrics(), episodes, True)
 
     def _collect(self, num_steps: int) -> TransitionBlock:
         """A block; an environment that is broken is replaced, and its worker's next incarnation goes on."""
@@ -336,10 +337,11 @@ class LocalBackend:
         assert self._learner is not None, "begin_training comes first"
         return self._learner
 
-    def _report(self, metrics: Mapping[str, float], episodes: list[tuple[EpisodeSummary, int]]) -> TrainReport:
+    def _report(self, metrics: Mapping[str, float], episodes: list[TrainingEpisode], settled: bool) -> TrainReport:
         return TrainReport(
             env_steps=self._limiter.env_steps,
             updates=self._trained().updates,
             metrics=metrics,
             episodes=tuple(episodes),
+            settled=settled,
         )

@@ -77,6 +77,17 @@ class EpisodeSummary:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class TrainingEpisode:
+    """An episode that ended in a stored block."""
+
+    summary: EpisodeSummary
+    policy_version: int
+    """Version of the weights that acted, of that block; -1 for the random policy."""
+    env_steps: int
+    """Environment steps of the run once that block was stored."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class TransitionBlock:
     """Consecutive steps of one worker, oldest first. Built by RolloutLoop, stored by ReplayShard.
 

@@ -3,7 +3,7 @@
 import contextlib
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +16,15 @@ from slotfilm_dist.episodes import episode_metrics
 from slotfilm_dist.evaluation.page import write_page
 from slotfilm_dist.evaluation.record import AGENT, Evaluation, save_evaluation, summarize
 from slotfilm_dist.learning.learner import dataset_hash, dataset_schema, pretrain_hash
-from slotfilm_dist.messages import EpisodeSummary
-from slotfilm_dist.metrics import metric_labels, phase_index
+from slotfilm_dist.messages import EpisodeSummary, TrainingEpisode
+from slotfilm_dist.metrics import phase_index
 from slotfilm_dist.progress import Phase, Progress
 from slotfilm_dist.replay.dataset import MANIFEST, open_dataset
 from slotfilm_dist.replay.dataset_writer import FrameDatasetWriter
+from slotfilm_dist.run_sinks import open_sinks
 from slotfilm_dist.runs import RunDirectory
 from slotfilm_dist.saving import Saver
-from slotfilm_dist.sinks import ClosableSink, FanOut, JsonLinesSink, PrometheusSink, TensorBoardSink
+from slotfilm_dist.sinks import FanOut
 from slotfilm_dist.stopping import Interrupted, StopFlag
 
 RECENT_EPISODES = 20
@@ -31,19 +32,6 @@ RECENT_EPISODES = 20
 DURING_SEEDS = 1_000_000
 """Distance of the seeds of evaluations during training from those of the final one."""
 POLICY_NAMES: dict[Player, str] = {"random": "random", "expert": "scripted expert", "agent": AGENT}
-
-
-def open_sinks(run: RunDirectory) -> list[ClosableSink]:
-    """Where a run's metrics go: its own files, and Prometheus unless that is turned off."""
-    sinks: list[ClosableSink] = [JsonLinesSink(run.metrics), TensorBoardSink(run.path / "tensorboard")]
-    config = run.config
-    if config.runtime.metrics_port and config.runtime.mode == "ray":
-        from slotfilm_dist.cluster.ray_sink import RaySink  # Ray is imported only where it is used
-
-        sinks.append(RaySink(metric_labels(config, run.path.name)))
-    elif config.runtime.metrics_port:
-        sinks.append(PrometheusSink(config.runtime.metrics_port, metric_labels(config, run.path.name)))
-    return sinks
 
 
 class Pipeline:
@@ -125,7 +113,8 @@ class Pipeline:
             already = writer.num_steps
             for block in self._backend.random_blocks(wanted - already, already) if already < wanted else ():
                 writer.append(block)
-                self._note_episodes([(e, -1) for e in block.episodes], writer.num_steps)
+                where = {"policy_version": -1, "env_steps": writer.num_steps}
+                self._note_episodes([TrainingEpisode(summary=episode, **where) for episode in block.episodes])
                 rate = (writer.num_steps - already) / (time.monotonic() - started)
                 self._progress.show(writer.num_steps, wanted, {"steps/s": f"{rate:.0f}"})
                 self._write("collect", writer.num_steps, 0, {"worker_env_steps_per_s": rate})
@@ -188,14 +177,22 @@ class Pipeline:
             self._backend, self._run.checkpoints, config.checkpoint.every_updates, int(values.get("updates", 0))
         )
         report = TrainReport(env_steps=0, updates=0, metrics={})
-        for report in self._backend.train(self._stop):
+
+        def evaluation_due(env_steps: int) -> bool:
+            return bool(config.evaluation.every_steps) and next_evaluation <= env_steps < total
+
+        def is_due(env_steps: int, updates: int) -> bool:
+            return evaluation_due(env_steps) or self._saver.due(updates)
+
+        for report in self._backend.train(self._stop, is_due):
             self._note(report)
-            if config.evaluation.every_steps and next_evaluation <= report.env_steps < total and not self._stop():
+            if report.settled and evaluation_due(report.env_steps) and not self._stop():
                 # A signal only breaks the evaluation off: training then stops by itself where its episode ends.
                 with contextlib.suppress(Interrupted):
                     self._evaluate_now(report)
-                    next_evaluation = report.env_steps + config.evaluation.every_steps
-            if self._saver.due(report):
+                    while next_evaluation <= report.env_steps:
+                        next_evaluation += config.evaluation.every_steps
+            if report.settled and self._saver.due(report.updates):
                 self._save(report, next_evaluation, with_replay=False)
         self._trained_steps = report.env_steps
         done = report.env_steps >= total
@@ -298,7 +295,7 @@ class Pipeline:
 
     def _note(self, report: TrainReport) -> None:
         """Write a report's numbers and show them."""
-        self._note_episodes(report.episodes, report.env_steps)
+        self._note_episodes(report.episodes)
         own = self._saver.age(report) | self._run.room() | self._eta(report)
         self._write("train", report.env_steps, report.updates, dict(report.metrics) | own)
         values = {
@@ -309,16 +306,16 @@ class Pipeline:
             values |= {"return": f"{np.mean(self._returns):.1f}", "success": f"{np.mean(self._solved):.0%}"}
         self._progress.show(report.env_steps, self._config.schedule.total_steps, values)
 
-    def _note_episodes(self, episodes: list[tuple[EpisodeSummary, int]] | tuple, env_steps: int) -> None:
+    def _note_episodes(self, episodes: Sequence[TrainingEpisode]) -> None:
         if not episodes:
             return
-        for episode, version in episodes:
-            self._run.log_episodes([episode], env_steps, version)
-            self._returns.append(episode.episode_return)
-            self._solved.append(episode.success_at_end)
-        summaries = [episode for episode, _ in episodes]
+        self._run.log_episodes(episodes)
+        summaries = [episode.summary for episode in episodes]
+        self._returns.extend(summary.episode_return for summary in summaries)
+        self._solved.extend(summary.success_at_end for summary in summaries)
         metrics = episode_metrics(summaries, self._backend.reward_term_names, self._config.sac.reward_scale)
-        self._write("train" if episodes[0][1] >= 0 else "collect", env_steps, None, metrics)
+        last = episodes[-1]
+        self._write("train" if last.policy_version >= 0 else "collect", last.env_steps, None, metrics)
 
     def _write(self, phase: Phase, env_steps: int, updates: int | None, values: Mapping[str, float]) -> None:
         axes = {"time_s": self._time_s(), "env_steps": env_steps, "phase": phase_index(phase)}

@@ -24,7 +24,7 @@ from slotfilm_dist import __version__
 from slotfilm_dist.atomic import append_whole, write_atomic
 from slotfilm_dist.config import TEMPERATURE_FIELDS, RunConfig
 from slotfilm_dist.config_files import changed_fields, save_config
-from slotfilm_dist.messages import EpisodeSummary
+from slotfilm_dist.messages import TrainingEpisode
 
 PACKAGES = ("ray", "torch", "torchvision", "mani_skill", "sapien", "gymnasium", "numpy", "msgpack", "safetensors")
 RUN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
@@ -120,10 +120,11 @@ class RunDirectory:
         """File of the metrics, one JSON object a line."""
         return self.path / "metrics.jsonl"
 
-    def log_episodes(self, episodes: Iterable[EpisodeSummary], env_steps: int, policy_version: int) -> None:
+    def log_episodes(self, episodes: Iterable[TrainingEpisode]) -> None:
         """Append finished training episodes; those that the disk does not take go with the next."""
-        own = {"env_steps": env_steps, "policy_version": policy_version}
-        self._unlogged += [json.dumps(dataclasses.asdict(episode) | own) + "\n" for episode in episodes]
+        for episode in episodes:
+            own = {"env_steps": episode.env_steps, "policy_version": episode.policy_version}
+            self._unlogged.append(json.dumps(dataclasses.asdict(episode.summary) | own) + "\n")
         with contextlib.suppress(OSError):
             append_whole(self.path / "episodes.jsonl", "".join(self._unlogged).encode())
             self._unlogged = []

@@ -41,9 +41,9 @@ class Saver:
         self._failed_in_a_row = 0
         self.num_written = self.num_failed = 0
 
-    def due(self, report: TrainReport) -> bool:
-        """Whether one should be written now."""
-        return report.updates >= self._next and time.monotonic() >= self._retry_at
+    def due(self, updates: int) -> bool:
+        """Whether one should be written after so many updates."""
+        return updates >= self._next and time.monotonic() >= self._retry_at
 
     def age(self, report: TrainReport) -> dict[str, float]:
         """How old the last one is, as metrics."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from slotfilm_dist.backend import Player, TrainReport
+from slotfilm_dist.backend import IsDue, Player, TrainReport, never_due
 from slotfilm_dist.cluster.evaluation import EvaluationPool
 from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
 from slotfilm_dist.cluster.hub_client import HubClient
@@ -159,7 +159,7 @@ class RayBackend:
         self._setup = self._counts.agent_setup()
         return env_steps
 
-    def train(self, should_stop: Callable[[], bool]) -> Iterator[TrainReport]:
+    def train(self, should_stop: Callable[[], bool], is_due: IsDue = never_due) -> Iterator[TrainReport]:
         """Train until the schedule's end, or until `should_stop`, reporting once a second."""
         self._build_replay()
         workers, reporter = self._workers, Reporter(self._config)

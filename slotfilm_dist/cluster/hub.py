@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from slotfilm_dist.cluster.messages import AgentSetup, BlockKey, BlockNotice, HubStatus, StepGrant, UpdateGrant
-from slotfilm_dist.messages import EpisodeSummary, WeightSnapshot
+from slotfilm_dist.messages import TrainingEpisode, WeightSnapshot
 from slotfilm_dist.replay.limiter import RateLimiter
 
 SLACK_STEPS = 64
@@ -74,7 +74,7 @@ class Hub:
         self._gone: dict[int, int] = {}
         self._steps_by_worker: dict[int, int] = {}
         self._acting: dict[int, tuple[int, float]] = {}
-        self._episodes: list[tuple[EpisodeSummary, int]] = []
+        self._episodes: list[TrainingEpisode] = []
         self._published: dict[int, float] = {-1: time.time()}
         self._snapshot: WeightSnapshot | None = None
         self._setup: AgentSetup | None = None
@@ -143,7 +143,8 @@ class Hub:
                 self._num_blocks += 1
                 worker = key.worker_id
                 self._steps_by_worker[worker] = self._steps_by_worker.get(worker, 0) + notice.num_steps
-                self._episodes += [(episode, notice.policy_version) for episode in notice.episodes]
+                where = {"policy_version": notice.policy_version, "env_steps": self._limiter.env_steps}
+                self._episodes += [TrainingEpisode(summary=episode, **where) for episode in notice.episodes]
 
     def pending(self, worker_id: int, incarnation: int) -> list[BlockKey]:
         """Blocks of a worker that were granted and not confirmed."""
@@ -266,7 +267,7 @@ class Hub:
         with self._lock:
             self._alive_workers = num_workers
 
-    def take_episodes(self) -> list[tuple[EpisodeSummary, int]]:
+    def take_episodes(self) -> list[TrainingEpisode]:
         """Episodes that ended in stored blocks since the last call."""
         with self._lock:
             episodes, self._episodes = self._episodes, []

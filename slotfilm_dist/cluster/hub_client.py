@@ -7,7 +7,7 @@ from slotfilm_dist.cluster.actors import HubActor
 from slotfilm_dist.cluster.clients import ANSWER_S, ActorLink
 from slotfilm_dist.cluster.messages import AgentSetup, BlockKey, BlockNotice, HubStatus, StepGrant, UpdateGrant
 from slotfilm_dist.config import RunConfig
-from slotfilm_dist.messages import EpisodeSummary, WeightSnapshot
+from slotfilm_dist.messages import TrainingEpisode, WeightSnapshot
 
 
 class HubClient:
@@ -114,7 +114,7 @@ class HubClient:
         """Say how many workers run."""
         self._call("note_alive", num_workers)
 
-    def take_episodes(self) -> list[tuple[EpisodeSummary, int]]:
+    def take_episodes(self) -> list[TrainingEpisode]:
         """Episodes that ended since the last call."""
         return self._call("take_episodes")
 

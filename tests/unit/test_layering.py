@@ -56,6 +56,7 @@ LEVELS: dict[str, int] = {
     "doctor": 4,
     "runs": 4,
     "saving": 4,
+    "run_sinks": 5,
     "pipeline": 5,
     "driver": 5,
     "chaos": 5,
@@ -79,6 +80,7 @@ SAME_LEVEL = {
     ("chaos", "driver"),
     ("chaos", "pipeline"),
     ("tuning", "pipeline"),
+    ("pipeline", "run_sinks"),
 }
 """The command line is the one place that reaches sideways: it starts the others."""
 

@@ -13,7 +13,7 @@ import pytest
 from filelock import FileLock
 from rich.console import Console
 
-from slotfilm_dist.backend import Player, TrainReport
+from slotfilm_dist.backend import IsDue, Player, TrainReport, never_due
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.config_files import load_config
 from slotfilm_dist.envs.reward import NUM_INPUTS, TERMS
@@ -51,6 +51,7 @@ class CountingBackend:
         self.calls: list[str] = []
         self.saved: list[dict[str, Any]] = []
         self.env_steps = config.schedule.random_steps
+        self.unsettled_until = 0
         self._during_play = during_play
 
     def prepare(self) -> None:
@@ -91,7 +92,7 @@ class CountingBackend:
         self.calls.append("begin" if resume_from is None else "resume")
         return {}
 
-    def train(self, should_stop: Callable[[], bool]) -> Iterator[TrainReport]:
+    def train(self, should_stop: Callable[[], bool], is_due: IsDue = never_due) -> Iterator[TrainReport]:
         while self.env_steps < self.config.schedule.total_steps and not should_stop():
             self.env_steps += 40
             self.calls.append(f"train {self.env_steps}")
@@ -99,7 +100,8 @@ class CountingBackend:
         yield self._report()
 
     def _report(self) -> TrainReport:
-        return TrainReport(env_steps=self.env_steps, updates=self.env_steps, metrics={}, episodes=())
+        settled = self.env_steps >= self.unsettled_until
+        return TrainReport(env_steps=self.env_steps, updates=self.env_steps, metrics={}, settled=settled)
 
     def play(self, player: Player, seeds: Sequence[int], should_stop: Callable[[], bool]) -> Iterator[EpisodeSummary]:
         self.calls.append(f"play {player} {seeds[0]}+{len(seeds)}")
@@ -256,8 +258,16 @@ def test_evaluations_during_training_come_on_time_and_keep_the_best(tmp_path: Pa
     backend = CountingBackend(config_of(every_steps=100))
     execute(tmp_path, backend)
     during = [i for i, call in enumerate(backend.calls) if call == "play agent 11000000+5"]
-    assert [backend.calls[i - 1] for i in during] == ["train 280", "train 400"][:1]
-    assert [saved["name"] for saved in backend.saved].count("best") == 1
+    assert [backend.calls[i - 1] for i in during] == ["train 280", "train 360"]
+    assert [saved["name"] for saved in backend.saved].count("best") == 1, "the second is no better"
+
+
+def test_evaluations_during_training_wait_for_a_report_that_is_settled(tmp_path: Path) -> None:
+    backend = CountingBackend(config_of(every_steps=100))
+    backend.unsettled_until = 320
+    execute(tmp_path, backend)
+    during = [i for i, call in enumerate(backend.calls) if call == "play agent 11000000+5"]
+    assert [backend.calls[i - 1] for i in during] == ["train 320", "train 360"]
 
 
 def test_signal_during_training_saves_everything_and_says_so(tmp_path: Path) -> None:
@@ -265,7 +275,7 @@ def test_signal_during_training_saves_everything_and_says_so(tmp_path: Path) -> 
     stop.signal_number = 0
     train = backend.train
 
-    def stopped_after_two(should_stop: Callable[[], bool]) -> Iterator[TrainReport]:
+    def stopped_after_two(should_stop: Callable[[], bool], is_due: IsDue = never_due) -> Iterator[TrainReport]:
         for count, report in enumerate(train(should_stop), start=1):
             if count == 2:
                 stop.signal_number = int(signal.SIGINT)

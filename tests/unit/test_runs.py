@@ -11,7 +11,7 @@ import pytest
 
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.config_files import load_config
-from slotfilm_dist.messages import EpisodeSummary
+from slotfilm_dist.messages import EpisodeSummary, TrainingEpisode
 from slotfilm_dist.runs import RunDirectory, describe_machine, new_run_directory, resumed_config
 
 CONFIG = RunConfig()
@@ -99,8 +99,8 @@ def test_episodes_are_appended_as_lines(tmp_path: Path) -> None:
         reward_terms=(1.0, 0.5),
     )
     with RunDirectory(tmp_path / "run", CONFIG) as run:
-        run.log_episodes([episode], 400, 3)
-        run.log_episodes([episode, episode], 800, 4)
+        run.log_episodes([TrainingEpisode(summary=episode, policy_version=3, env_steps=400)])
+        run.log_episodes([TrainingEpisode(summary=episode, policy_version=4, env_steps=800)] * 2)
         lines = [json.loads(line) for line in (run.path / "episodes.jsonl").read_text().splitlines()]
     assert [line["env_steps"] for line in lines] == [400, 800, 800]
     assert lines[0]["seed"] == 5
@@ -127,9 +127,9 @@ def test_episodes_that_a_full_disk_refuses_are_written_with_the_next(tmp_path: P
     with RunDirectory(tmp_path / "run", CONFIG) as run:
         log = run.path / "episodes.jsonl"
         log.symlink_to("/dev/full")
-        run.log_episodes([some_episode(1)], 100, 0)
+        run.log_episodes([TrainingEpisode(summary=some_episode(1), policy_version=0, env_steps=100)])
         log.unlink()
-        run.log_episodes([some_episode(2)], 200, 5)
+        run.log_episodes([TrainingEpisode(summary=some_episode(2), policy_version=5, env_steps=200)])
         lines = [json.loads(line) for line in log.read_text().splitlines()]
     assert [(line["seed"], line["env_steps"], line["policy_version"]) for line in lines] == [(1, 100, 0), (2, 200, 5)]
 

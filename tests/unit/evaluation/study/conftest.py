@@ -8,7 +8,7 @@ import pytest
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.config_files import save_config
 from slotfilm_dist.evaluation.record import save_evaluation, summarize
-from slotfilm_dist.messages import EpisodeSummary
+from slotfilm_dist.messages import EpisodeSummary, TrainingEpisode
 from slotfilm_dist.runs import RunDirectory
 from slotfilm_dist.sinks import JsonLinesSink
 from slotfilm_dist.variants import apply_variant
@@ -55,7 +55,9 @@ def write_small_run(folder, variant, seed, *, level=10.0, num_solved=3, over=Tru
     for index, steps in enumerate(ends):
         learning = steps > config.schedule.random_steps
         value = level - 0.1 * (len(ends) - 1 - index) if learning else 0.5
-        run.log_episodes([make_episode(value, steps)], steps, steps if learning else -1)
+        version = steps if learning else -1
+        episode = TrainingEpisode(summary=make_episode(value, steps), policy_version=version, env_steps=steps)
+        run.log_episodes([episode])
     sink = JsonLinesSink(run.metrics)
     for step in range(0, 101, 10) if pretrained else ():
         losses = dict.fromkeys(
