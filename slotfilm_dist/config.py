@@ -378,7 +378,7 @@ class SacConfig:
     annealing_updates: int = 500_000
     """Updates over which the annealed temperature falls."""
     target_entropy: float = -7.0
-    """Target entropy of `auto`, in nats; minus the action dimensions by default."""
+    """Target entropy of `auto`, in nats: minus the action's dimensions, 7 with the paper's `env.control_mode`."""
     log_std_min: float = -5.0
     """Lower clamp of the policy's log standard deviation."""
     log_std_max: float = 2.0

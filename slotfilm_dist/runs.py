@@ -28,9 +28,10 @@ from slotfilm_dist.messages import TrainingEpisode
 
 PACKAGES = ("ray", "torch", "torchvision", "mani_skill", "sapien", "gymnasium", "numpy", "msgpack", "safetensors")
 RUN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-RESUMABLE = ("schedule.total_steps", "evaluation", "runtime", "checkpoint", "lr")
-RESUMABLE += tuple(f"sac.{name}" for name in TEMPERATURE_FIELDS)
-"""Sections and fields that may change when a run is resumed: budgets, places, and what is annealed by hand."""
+RESUMABLE = ("schedule.total_steps", "evaluation", "runtime", "checkpoint")
+"""Sections and fields that may change when a run is resumed: budgets and places."""
+BY_HAND = {"sac": ("lr", *(f"sac.{name}" for name in TEMPERATURE_FIELDS)), "ddpg": ("ddpg.lr",)}
+"""Those of an algorithm that are annealed by hand, and may change too."""
 FIXED = ("runtime.block_steps",)
 """Fields of those sections that may not: stored replay is cut into blocks of that size."""
 
@@ -57,11 +58,12 @@ def new_run_directory(root: Path, config: RunConfig, preset: str, name: str = ""
 def resumed_config(path: Path, config: RunConfig, changed: RunConfig) -> RunConfig:
     """The changed config of a run that goes on; raises ``ValueError`` if it touches what was already learned from."""
     changes = changed_fields(config, changed)
-    fixed = [n for n in changes if n in FIXED or not {n, n.split(".")[0]} & {*RESUMABLE}]
+    resumable = (*RESUMABLE, *BY_HAND[config.algorithm])
+    fixed = [n for n in changes if n in FIXED or not {n, n.split(".")[0]} & {*resumable}]
     if fixed:
         raise ValueError(
             f"--resume {path}: {', '.join(fixed)} cannot change in a run that has begun; "
-            f"only {', '.join(RESUMABLE)} can, without {', '.join(FIXED)}. Start a new run instead"
+            f"only {', '.join(resumable)} can, without {', '.join(FIXED)}. Start a new run instead"
         )
     return changed
 

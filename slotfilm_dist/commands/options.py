@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NoReturn
 
+from slotfilm_dist.commands.effects import check_effects
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.config_files import from_dict, to_dict
 from slotfilm_dist.presets import PRESETS, preset_named
@@ -86,7 +87,7 @@ def placed_on(config: RunConfig, device: str | None) -> RunConfig:
 
 
 def build_config(preset: str, variant: str, fields: Sequence[str], *, show_fields: bool = False) -> RunConfig:
-    """The config that a command line asks for.
+    """The config that a command line asks for: the variant of the preset's agent with these fields, as in a grid.
 
     Args:
         preset: name of the budget.
@@ -95,17 +96,21 @@ def build_config(preset: str, variant: str, fields: Sequence[str], *, show_field
         show_fields: print every field and exit instead.
 
     Raises:
-        ValueError: an unknown name (with the nearest known one) or an impossible value.
+        ValueError: an unknown name (with the nearest known one), an impossible value, or a field without effect.
     """
-    from slotfilm_dist.envs.tasks import adapt_config, check_goal
+    from slotfilm_dist.envs.tasks import adapt_config
 
     base = preset_named(preset)
     task = _value_of(fields, "--env.task")
     if task:
         base = replace(base, env=replace(base.env, task=task))
-    base = apply_variant(variant or base.variant, adapt_config(base))
-    config = change_fields(base, ["--help"] if show_fields else fields)
-    check_goal(config)
+    base = adapt_config(base)
+    plain = apply_variant(variant or base.variant, base)
+    if show_fields:
+        change_fields(plain, ["--help"])
+    changed = change_fields(base, fields)
+    config = apply_variant(plain.variant, changed)
+    check_effects(fields, plain, changed, config)
     return config
 
 

@@ -5,6 +5,7 @@ import difflib
 from dataclasses import dataclass
 
 from slotfilm_dist.config import RunConfig, check
+from slotfilm_dist.config_files import changed_fields
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -65,6 +66,22 @@ def adapt_config(config: RunConfig) -> RunConfig:
     if encoder.num_slots == defaults.encoder.num_slots:
         encoder = dataclasses.replace(encoder, num_slots=max(num_objects, 1))
     return dataclasses.replace(config, env=env, obs=obs, encoder=encoder)
+
+
+def objection(base: RunConfig, config: RunConfig) -> str:
+    """Why a variant has no meaning on its task: it asks for what is not there, or is the base again; else empty.
+
+    Args:
+        base: the proposed agent.
+        config: the variant of it.
+    """
+    task = task_named(config.env.task)
+    changed = changed_fields(base, config).keys() - {"variant"}
+    if not task.goal and "encoder.goal" in changed and config.encoder.goal:
+        return f"{task.env_id} has no goal point to query"
+    if not task.own_reward and changed and all(field.startswith("reward.") for field in changed):
+        return f"{task.env_id} brings its own reward"
+    return ""
 
 
 def check_goal(config: RunConfig) -> None:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from slotfilm_dist.config import TEMPERATURE_FIELDS, RunConfig, SacConfig, check
+from slotfilm_dist.config import TEMPERATURE_FIELDS, DdpgConfig, RunConfig, SacConfig, check
 from slotfilm_dist.config_files import config_hash
 from slotfilm_dist.envs.reward import rewards_of
 from slotfilm_dist.learning.checkpoint import Checkpoint, plain_tensors
@@ -261,7 +261,7 @@ def learning_hash(config: RunConfig) -> str:
 
     A resume may change budgets, places, rates and temperature; `runs.resumed_config` refuses the rest.
     """
-    own = (config.ddpg,) if config.algorithm == "ddpg" else ()
+    own = (dataclasses.replace(config.ddpg, lr=DdpgConfig().lr),) if config.algorithm == "ddpg" else ()
     sac = dataclasses.replace(config.sac, **{name: getattr(SacConfig(), name) for name in TEMPERATURE_FIELDS})
     return config_hash(config.variant, config.seed, config.env, config.obs, config.encoder, sac, *own)
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 from slotfilm_dist.config import CheckpointConfig, RunConfig, RuntimeConfig
-from slotfilm_dist.config_files import changed_fields, config_hash
-from slotfilm_dist.envs.tasks import check_goal, task_named
+from slotfilm_dist.config_files import config_hash
+from slotfilm_dist.envs.tasks import check_goal, objection
 from slotfilm_dist.learning.learner import dataset_hash, pretrain_hash
 from slotfilm_dist.replay.dataset import MANIFEST
 from slotfilm_dist.variants import SECTIONS, VARIANTS, apply_variant
@@ -64,16 +64,8 @@ def select_variants(only: Sequence[str], exclude: Sequence[str]) -> list[str]:
 
 def meaningless_variants(base: RunConfig, variants: Iterable[str]) -> dict[str, str]:
     """The variants that the base's task makes impossible or the proposed agent again, each with the reason."""
-    task = task_named(base.env.task)
-    reasons: dict[str, str] = {}
-    for name in variants:
-        config = apply_variant(name, base)
-        changed = changed_fields(base, config).keys() - {"variant"}
-        if not task.goal and "encoder.goal" in changed and config.encoder.goal:
-            reasons[name] = f"{task.env_id} has no goal point to query"
-        elif not task.own_reward and changed and all(field.startswith("reward.") for field in changed):
-            reasons[name] = f"{task.env_id} brings its own reward"
-    return reasons
+    reasons = {name: objection(base, apply_variant(name, base)) for name in variants}
+    return {name: reason for name, reason in reasons.items() if reason}
 
 
 def build_trials(base: RunConfig, variants: Iterable[str], num_seeds: int) -> list[RunConfig]:

@@ -142,22 +142,23 @@ def test_steps_after_a_fallback_to_an_older_checkpoint_are_stored_although_repla
 def test_reports_come_where_something_is_due_and_episodes_carry_their_own_step_whatever_the_clock_says(
     local: RunConfig, make_dataset: MakeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    dataset, seen = make_dataset(local), []
-    for report_s in (1e-9, 3600.0):
+    dataset = make_dataset(local)
+
+    def run(report_s: float) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
         monkeypatch.setattr("slotfilm_dist.local.REPORT_S", report_s)
-        left = [300, 450]  # environment steps
-        due: list[tuple[int, int]] = []
-        episodes: list[tuple[int, int]] = []
+        marks, due, episodes = [300, 450], [], []
         backend = begun(local, dataset, tmp_path / "switches")
-        for report in backend.train(lambda: False, lambda env_steps, _: bool(left) and env_steps >= left[0]):
+        for report in backend.train(lambda: False, lambda env_steps, _: bool(marks) and env_steps >= marks[0]):
             episodes += [(episode.summary.seed, episode.env_steps) for episode in report.episodes]
-            if report.settled and left and report.env_steps >= left[0]:
+            if report.settled and marks and report.env_steps >= marks[0]:
                 due.append((report.env_steps, report.updates))
-                del left[0]
-        assert not left
-        seen.append((due, episodes))
-    assert seen[0] == seen[1]
-    steps = [env_steps for _, env_steps in seen[0][1]]
+                del marks[0]
+        assert not marks
+        return due, episodes
+
+    due, episodes = run(report_s=1e-9)
+    assert (due, episodes) == run(report_s=3600.0)
+    steps = [env_steps for _, env_steps in episodes]
     assert steps == sorted(set(steps)), "one episode ends at a time"
 
 

@@ -13,6 +13,7 @@ from slotfilm_dist.config import RunConfig
 from slotfilm_dist.config_files import save_config
 from slotfilm_dist.presets import smoke
 from slotfilm_dist.runs import RunDirectory
+from slotfilm_dist.variants import apply_variant
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
@@ -57,7 +58,14 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (("train", "--runtime.mode", "rya"), "runtime.mode"),
         (("train", "smoke", *NO_WEIGHTS), "'nothing.pt': there is no such file"),
         (("grid", "smoke", *NO_WEIGHTS), "'nothing.pt': there is no such file"),
-        (("train", "quick", "--encoder.goal", "--variant", "state_only"), "'state_only' has no slots"),
+        (("train", "quick", "--encoder.goal", "--encoder.fusion", "state_only"), "'state_only' has no slots"),
+        (("train", "--encoder.goal", "--variant", "state_only"), "'state_only' always has encoder.goal = False"),
+        (("train", "--variant", "varpi_1", "--reward.varpi", "2"), "'varpi_1' always has reward.varpi = 1.0"),
+        (("train", "--variant", "cnn", "--pretrain.steps=7"), "'cnn' always has pretrain.steps = 0"),
+        (("train", "--variant", "drqv2", "--lr.actor", "1e-3"), "its own fields are --ddpg.*"),
+        (("train", *ON_STACKCUBE, "--variant", "alpha_5"), "StackCube-v1 brings its own reward; take another variant"),
+        (("train", *ON_STACKCUBE, "--env.goal_visible"), "--env.goal_visible: StackCube-v1 brings its own reward and"),
+        (("train", "--obs.num_objects", "1"), "obs.num_objects = 1: PickBanana-v1 has 2"),
         (
             ("train", "quick", "--encoder.goal_out_of_view_bias", "10"),
             "_bias = 10.0: must be 0 or less",
@@ -184,3 +192,13 @@ def test_fields_are_listed_with_their_defaults(capsys: pytest.CaptureFixture[str
         main(["train", "smoke", "--fields"])
     assert stop.value.code in (0, None)
     assert "--sac.gamma" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("variant", ["drqv2", "no_static", "cnn", "reward_scale_5", "oracle_state"])
+def test_train_makes_of_variant_and_fields_what_a_grid_makes_of_them(variant: str) -> None:
+    fields = ("--schedule.total_steps", "50000", "--schedule.random_steps", "10000", "--lr.critic_value", "3e-4")
+    fields = ("--sac.reward_scale", "4", "--reward.weights.place", "3", *(fields if variant != "drqv2" else fields[:4]))
+    expected = apply_variant(variant, build_config("laptop", "slotfilm", fields))
+    assert build_config("laptop", variant, fields) == expected
+    if variant == "drqv2":
+        assert expected.ddpg.std_steps < expected.schedule.total_steps < 50_000, "noise and budget are scaled"
