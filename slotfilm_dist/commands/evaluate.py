@@ -17,15 +17,26 @@ from slotfilm_dist.commands.options import (
 )
 from slotfilm_dist.config_files import load_config
 
-PARTS = ("policy", "perception", "robustness", "film_strips", "reward_windows")
+PARTS: dict[str, set[str]] = {
+    "policy": {"policy", "episodes"},
+    "perception": {"episodes", "steps", "frames", "checkpoint"},
+    "robustness": {"episodes", "hold", "checkpoint"},
+    "film_strips": {"policy", "episodes", "checkpoint"},
+    "reward_windows": set(),
+}
+"""What `--what` takes, and the options that each part reads beside those of all."""
 
 
 def main(arguments: Sequence[str]) -> int:
     """Evaluate; gives the exit code."""
-    options, fields = parse_with_fields(_parser(), arguments)
+    parser = _parser()
+    options, fields = parse_with_fields(parser, arguments)
     if options.episodes is not None and options.episodes < 1:
         raise ValueError(f"--episodes {options.episodes}: must be 1 or more")
     episode_seeds(options.seed, options.episodes or 50)
+    for name in sorted(set().union(*PARTS.values()) - PARTS[options.what]):
+        if getattr(options, name) != parser.get_default(name):
+            raise ValueError(f"--{name}: --what {options.what} does not read it; leave it away")
     if options.run and fields:
         raise ValueError(f"{fields[0]}: a run's own config decides; leave the fields away")
     if options.what == "policy":
@@ -92,8 +103,6 @@ def _parser() -> Parser:
 
 def _play(options: argparse.Namespace, fields: Sequence[str]) -> int:
     """Episodes of a policy: return and success."""
-    if options.checkpoint != "last":
-        raise ValueError(f"--checkpoint {options.checkpoint}: plain episodes take the newest one; leave it away")
     num_episodes = options.episodes or 50
     seeds = episode_seeds(options.seed, num_episodes)
     player = options.policy or ("agent" if options.run else "")

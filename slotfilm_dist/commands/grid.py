@@ -64,7 +64,7 @@ def _parser() -> Parser:
         prog="slotfilm grid",
         description="Train every variant of the study with several seeds, as trials of Ray Tune: on the cluster that "
         "RAY_ADDRESS names, or on this machine. The same command again goes on: trials that are over are left alone.",
-        epilog=FIELDS_NOTE + " Here they change the proposed agent, and every variant is its difference from that.",
+        epilog=FIELDS_NOTE,
     )
     add = parser.add_argument
     add("preset", nargs="?", default="quick", help=f"budget: {', '.join(PRESETS)} (default: %(default)s)")

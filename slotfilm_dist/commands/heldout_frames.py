@@ -1,7 +1,7 @@
 """Collects held-out frames for measurements, or takes those that are there: the same ones for every variant."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -9,7 +9,7 @@ import torch
 from slotfilm_dist.commands.options import episode_seeds
 from slotfilm_dist.commands.trained_agent import TrainedAgent, load_trained_agent
 from slotfilm_dist.config import RunConfig
-from slotfilm_dist.config_files import config_hash
+from slotfilm_dist.config_files import changed_fields, config_hash
 from slotfilm_dist.evaluation.labelled_frames import (
     LabelledFrames,
     collect_frames,
@@ -66,6 +66,7 @@ def heldout_frames(request: FrameRequest, agent: TrainedAgent, artifacts: Path, 
     actor = agent if request.source == "agent" else None
     if request.label.startswith("agent-of-"):
         actor = load_trained_agent(Path(request.source), "last", _device(agent), artifacts)
+        _check_same_scene(config, actor.config, request.source)
     path = artifacts / frames_file(config, request, actor.weights if actor else request.source)
     if path.exists():
         progress.say(f"evaluate  held-out frames are there: {path}")
@@ -73,6 +74,14 @@ def heldout_frames(request: FrameRequest, agent: TrainedAgent, artifacts: Path, 
     frames = _collect(config, request, _num_steps(config, request), actor, progress)
     save_frames(frames, path)
     return frames
+
+
+def _check_same_scene(config: RunConfig, other: RunConfig, source: str) -> None:
+    """Raise ``ValueError`` if an agent cannot act in the environment of another run's config."""
+    fields = changed_fields(replace(config.env, max_steps=other.env.max_steps), other.env, "env.")
+    fields |= changed_fields(config.obs, other.obs, "obs.") if config.obs.state_fields != other.obs.state_fields else {}
+    if fields:
+        raise ValueError(f"--frames {source}: it was trained with another {', '.join(fields)}; take another run's")
 
 
 def frames_file(config: RunConfig, request: FrameRequest, who: str) -> str:

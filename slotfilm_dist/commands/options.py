@@ -19,7 +19,10 @@ from slotfilm_dist.variants import VARIANTS, apply_variant
 from slotfilm_dist.weights_file import weights_file_sha256
 
 TOP_FIELDS = tuple(field.name for field in dataclasses.fields(RunConfig))
-FIELDS_NOTE = "Every field of the config is an option too, as in --sac.temperature 0.2; `--fields` lists them all."
+FIELDS_NOTE = (
+    "Every field of the config is an option too, as in --sac.temperature 0.2; `--fields` lists them all. They \
+change the proposed agent, and a variant is its difference from that."
+)
 
 
 class Parser(argparse.ArgumentParser):

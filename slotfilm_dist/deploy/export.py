@@ -145,8 +145,10 @@ def policy_inputs(config: RunConfig) -> dict[str, PolicyInput]:
     return inputs
 
 
-def random_observation(inputs: Mapping[str, PolicyInput], rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """An observation of noise: every pixel value, states of a few units, a goal in or out of view."""
+def random_observation(
+    inputs: Mapping[str, PolicyInput], rng: np.random.Generator, encoder: AgentEncoder
+) -> dict[str, np.ndarray]:
+    """An observation of noise: every pixel value, states as the encoder is used to, a goal in or out of view."""
     observation: dict[str, np.ndarray] = {}
     for name, wanted in inputs.items():
         if wanted.dtype == "uint8":
@@ -154,7 +156,8 @@ def random_observation(inputs: Mapping[str, PolicyInput], rng: np.random.Generat
         elif name == "goal":
             observation[name] = np.array([*rng.random(2), rng.integers(2)], np.float32)
         else:
-            observation[name] = rng.standard_normal(wanted.shape, dtype=np.float32)
+            mean, std = (value.cpu().numpy() for value in (encoder.proprio_mean, encoder.proprio_std))
+            observation[name] = (mean + std * rng.standard_normal(wanted.shape)).astype(np.float32)
     return observation
 
 
@@ -181,7 +184,7 @@ def _batch(observation: Mapping[str, np.ndarray]) -> tuple[Tensor, ...]:
 
 
 def _trace(agent: ExportedAgent, inputs: Mapping[str, PolicyInput]) -> torch.export.ExportedProgram:
-    example = _batch(random_observation(inputs, np.random.default_rng(0)))
+    example = _batch(random_observation(inputs, np.random.default_rng(0), agent.encoder))
     with torch.no_grad():
         program = torch.export.export(agent, example)
     for node in program.graph.nodes:  # where the files lay on this machine is nobody's business
@@ -257,7 +260,7 @@ def _verify(
     policy, rng, difference = load_policy(folder, backend), np.random.default_rng(1), 0.0
     with torch.inference_mode():
         for _ in range(COMPARISONS):
-            observation = random_observation(inputs, rng)
+            observation = random_observation(inputs, rng, agent.encoder)
             own = agent(*_batch(observation))[0].numpy()
             difference = max(difference, float(np.abs(policy.act(**observation) - own).max()))
     if not difference <= tolerance:
@@ -267,7 +270,7 @@ def _verify(
         )
     times_ms: list[float] = []
     for _ in range(WARM_UP_PASSES + TIMED_PASSES):
-        observation, began_s = random_observation(inputs, rng), time.perf_counter()
+        observation, began_s = random_observation(inputs, rng, agent.encoder), time.perf_counter()
         policy.act(**observation)
         times_ms.append(1e3 * (time.perf_counter() - began_s))
     timed = times_ms[WARM_UP_PASSES:]

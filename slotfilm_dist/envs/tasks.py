@@ -20,6 +20,8 @@ class Task:
     """Attribute that holds the goal's actor; empty for none (its state fields then read zero)."""
     max_steps: int
     """Length of an episode in control steps."""
+    placed: str
+    """Key of the task's info that says that the object is at its target."""
     robot: str = "panda_wristcam"
     """ManiSkill's name of the robot."""
     own_reward: bool = False
@@ -32,11 +34,16 @@ TASKS: dict[str, Task] = {
         objects=("banana", "bowl"),
         goal="goal_site",
         max_steps=400,
+        placed="is_placed",
         robot="panda_wristcam_direct",
         own_reward=True,
     ),
-    "PickCube-v1": Task(env_id="PickCube-v1", objects=("cube",), goal="goal_site", max_steps=100),
-    "StackCube-v1": Task(env_id="StackCube-v1", objects=("cubeA", "cubeB"), goal="", max_steps=100),
+    "PickCube-v1": Task(
+        env_id="PickCube-v1", objects=("cube",), goal="goal_site", max_steps=100, placed="is_obj_placed"
+    ),
+    "StackCube-v1": Task(
+        env_id="StackCube-v1", objects=("cubeA", "cubeB"), goal="", max_steps=100, placed="is_cubeA_on_cubeB"
+    ),
 }
 
 

@@ -130,7 +130,7 @@ class WristEnv:
             "terminated": ended,
             "truncated": truncated,
             "success": success,
-            "placed": _array(info["is_placed"], bool) if "is_placed" in info else success,
+            "placed": _array(info[self._task.placed], bool),
             "grasped": _array(scene.grasped, bool),
             "contact": _array(scene.contact, bool),
             "reward_terms": self._terms(reward, info),

@@ -112,19 +112,19 @@ def _window(values: Float64[np.ndarray, " points"]) -> int:
 
 
 def _episode_window(record: RunRecord) -> int:
-    return min(_EPISODE_WINDOW, max(1, len(record.episodes) // 5))
+    return min(_EPISODE_WINDOW, max(1, len(record.learning_episodes) // 5))
 
 
 def _draw_return(record: RunRecord, figure: Figure) -> str:
     trained = record.of_agent
-    if not record.episodes and not trained:
+    if not record.learning_episodes and not trained:
         return ""
     figure.set_size_inches(10, 5)
     axes = figure.subplots()
     window = _episode_window(record)
-    if record.episodes:
-        steps = np.array([e.env_steps for e in record.episodes], dtype=np.float64)
-        returns = np.array([e.summary.episode_return for e in record.episodes])
+    if record.learning_episodes:
+        steps = np.array([e.env_steps for e in record.learning_episodes], dtype=np.float64)
+        returns = np.array([e.summary.episode_return for e in record.learning_episodes])
         axes.scatter(steps, returns, s=8, color=GREY, alpha=0.5, linewidths=0, label="training episode")
         axes.plot(steps, causal_mean(returns, window), color=BLUE, label=f"mean of the last {window} episodes")
         _episode_axis(axes, steps)
@@ -180,16 +180,16 @@ def _through(x: Points, y: Points) -> _Line:
 
 def _draw_success(record: RunRecord, figure: Figure) -> str:
     trained = record.of_agent
-    if not record.episodes and not trained:
+    if not record.learning_episodes and not trained:
         return ""
     figure.set_size_inches(10, 4.2)
     axes = figure.subplots()
     window = _episode_window(record)
-    steps = [e.env_steps for e in record.episodes]
+    steps = [e.env_steps for e in record.learning_episodes]
     curves = (
-        ("grasped at some step", [e.summary.grasped_once for e in record.episodes]),
-        ("solved at some step", [e.summary.success_once for e in record.episodes]),
-        ("solved at the end", [e.summary.success_at_end for e in record.episodes]),
+        ("grasped at some step", [e.summary.grasped_once for e in record.learning_episodes]),
+        ("solved at some step", [e.summary.success_once for e in record.learning_episodes]),
+        ("solved at the end", [e.summary.success_at_end for e in record.learning_episodes]),
     )
     for (label, flags), (color, line) in zip(curves, ((SKY, ":"), (GREEN, "-."), (BLUE, "-")), strict=True):
         if flags:
@@ -218,14 +218,14 @@ def _draw_success(record: RunRecord, figure: Figure) -> str:
 
 def _draw_reward_terms(record: RunRecord, figure: Figure) -> str:
     names = record.reward_term_names
-    if not record.episodes or len(names) < 2:
+    if not record.learning_episodes or len(names) < 2:
         return ""
     figure.set_size_inches(10, 4.2)
     left, right = figure.subplots(1, 2)
     window = _episode_window(record)
-    steps = np.array([e.env_steps for e in record.episodes], dtype=np.float64)
-    sums = np.array([e.summary.reward_terms for e in record.episodes], dtype=np.float64)
-    lengths = np.array([e.summary.length for e in record.episodes], dtype=np.float64)[:, None]
+    steps = np.array([e.env_steps for e in record.learning_episodes], dtype=np.float64)
+    sums = np.array([e.summary.reward_terms for e in record.learning_episodes], dtype=np.float64)
+    lengths = np.array([e.summary.length for e in record.learning_episodes], dtype=np.float64)[:, None]
     smooth = np.stack([causal_mean(column, window) for column in (sums / np.maximum(lengths, 1)).T])
     for (color, line), name, curve in zip(LINES * len(names), names, smooth, strict=False):
         left.plot(steps, curve, color=color, ls=line, label=name)

@@ -178,7 +178,7 @@ def _position_card(record: RunRecord) -> str:
 
 def _progress_card(record: RunRecord) -> str:
     steps, updates, seconds = (record.last(name) or 0.0 for name in ("env_steps", "updates", "time_s"))
-    notes = [f"{html.number(updates, 0)} updates", f"{len(record.episodes)} training episodes"]
+    notes = [f"{html.number(updates, 0)} updates", f"{len(record.learning_episodes)} training episodes"]
     if record.config:
         total = record.config.schedule.total_steps
         notes.insert(0, f"of {html.number(total, 0)} planned ({html.percent(steps / total)})")

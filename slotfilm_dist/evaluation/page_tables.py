@@ -43,9 +43,9 @@ def evaluation_table(record: RunRecord) -> str:
 def reward_table(record: RunRecord) -> str:
     """How the reward is made up early, midway and late in training (Table 2)."""
     names = record.reward_term_names
-    if len(names) < 2 or len(record.episodes) < len(_STAGES):
+    if len(names) < 2 or len(record.learning_episodes) < len(_STAGES):
         return ""
-    sums = np.array([e.summary.reward_terms for e in record.episodes], dtype=np.float64)
+    sums = np.array([e.summary.reward_terms for e in record.learning_episodes], dtype=np.float64)
     percents = 100 * sums / np.maximum(sums.sum(axis=1, keepdims=True), 1e-12)
     rows = [
         (stage, *(f"{part[:, i].mean():.1f} ± {part[:, i].std():.1f}" for i in range(len(names))))

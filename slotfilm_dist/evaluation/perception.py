@@ -13,13 +13,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
+from jaxtyping import Bool, Float, Int, Int32, UInt8
 from torch import Tensor
 
 from slotfilm_dist.evaluation.corruptions import CORRUPTIONS, corrupt_frames
 from slotfilm_dist.evaluation.labelled_frames import LabelledFrames
 from slotfilm_dist.learning.perception_losses import attention_share, best_matching
-from slotfilm_dist.learning.perception_quality import PerceptionQuality, perception_quality
+from slotfilm_dist.learning.perception_quality import (
+    PerceptionQuality,
+    only_slots,
+    perception_quality,
+    strongest_slots,
+)
 from slotfilm_dist.nets.encoder import SlotFusionEncoder
 from slotfilm_dist.nets.perception import Perception
 
@@ -117,6 +122,8 @@ def measure_perception(
 ) -> PerceptionResult:
     """Measure an encoder on frames, clean and corrupted; an affine corruption moves the labels with the picture.
 
+    Of surplus slots only the strongest count, one an object, chosen by the attention in the clean frames.
+
     A label under an occluding square stays: nothing tells the encoder that it need not guess.
 
     Args:
@@ -127,13 +134,18 @@ def measure_perception(
         shown: called with each name before it is measured.
     """
     quality, intervals, by_position, by_attention = {}, {}, {}, {}
+    assert encoder.perception is not None
+    matched_visibility = encoder.perception.matched_visibility
     clean: Perception | None = None
     clean_matching: Tensor | None = None
+    counted: list[int] = []
     for name in dict.fromkeys(("clean", *names)):
         shown(name)
         rgb, uv_moved = corrupt_frames(frames.rgb, frames.uv, name, seed)
         visible_now = frames.visible & ((uv_moved >= 0) & (uv_moved < 1)).all(axis=2)
-        seen = perceive_frames(encoder, rgb)
+        everything = perceive_frames(encoder, rgb)
+        counted = counted or strongest_slots(everything.attention.numpy(), frames.uv.shape[1])
+        seen = only_slots(everything, counted, matched_visibility=matched_visibility)
         uv, visible = torch.from_numpy(uv_moved), torch.from_numpy(visible_now)
         quality[name] = _quality(encoder, seen, uv, visible)
         intervals[name] = _intervals(encoder, seen, uv, visible, frames.episode, seed)
@@ -141,7 +153,7 @@ def measure_perception(
         by_position[name] = swap_rate(matching.numpy(), visible_now, frames.episode)
         by_attention[name] = swap_rate(attention_matching(seen.attention, uv).numpy(), visible_now, frames.episode)
         if clean is None:
-            clean, clean_matching = seen, matching
+            clean, clean_matching = everything, torch.tensor(counted)[matching]
     assert clean is not None
     assert clean_matching is not None
     return PerceptionResult(
@@ -249,12 +261,6 @@ def frame_rows(
                 }
             )
     return rows
-
-
-def strongest_slots(attention: Float32[np.ndarray, "frames slots tokens"], count: int) -> list[int]:
-    """The slots with the highest mean peak of attention, in their own order (Figure 14)."""
-    peaks = attention.max(axis=2).mean(axis=0)
-    return sorted(np.argsort(-peaks, kind="stable")[:count].tolist())
 
 
 def summary(result: PerceptionResult) -> dict[str, Any]:

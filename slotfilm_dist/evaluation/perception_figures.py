@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 
 from slotfilm_dist.evaluation.figure_style import BLUE, GREY, ORANGE, STYLE
 from slotfilm_dist.evaluation.labelled_frames import LabelledFrames
-from slotfilm_dist.evaluation.perception import PerceptionResult, strongest_slots
+from slotfilm_dist.evaluation.perception import PerceptionResult
 from slotfilm_dist.evaluation.video import OBJECT_COLORS, SLOT_COLORS, attention_overlay
+from slotfilm_dist.learning.perception_quality import strongest_slots
 
 _PANEL_PX = 192
 _PANEL_IN = 1.35

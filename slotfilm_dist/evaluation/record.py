@@ -19,7 +19,7 @@ from jaxtyping import Float64, Int64
 from slotfilm_dist.config import RunConfig
 from slotfilm_dist.config_files import load_config
 from slotfilm_dist.evaluation.statistics import not_superseded, wilson_interval
-from slotfilm_dist.messages import EpisodeSummary
+from slotfilm_dist.messages import EpisodeSummary, TrainingEpisode
 
 AGENT = "trained, deterministic"
 """What `Evaluation.policy` says of a run's own agent."""
@@ -85,17 +85,6 @@ def save_evaluation(evaluation: Evaluation, run_dir: Path) -> Path:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class TrainingEpisode:
-    """One line of `episodes.jsonl`."""
-
-    summary: EpisodeSummary
-    env_steps: int
-    """Environment steps of the run when the episode was stored."""
-    policy_version: int
-    """Version of the weights that acted; -1 for the random policy."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class RunRecord:
     """Everything a run directory holds."""
 
@@ -106,12 +95,17 @@ class RunRecord:
     lines: tuple[dict[str, Any], ...]
     """The lines of `metrics.jsonl`."""
     episodes: tuple[TrainingEpisode, ...]
-    """Training episodes, oldest first."""
+    """Episodes of collection and training, oldest first: the lines of `episodes.jsonl`."""
     evaluations: tuple[Evaluation, ...]
     """By environment steps."""
     videos: tuple[Path, ...]
     missing: list[str] = field(default_factory=list)
     """What is not there and how to get it, one sentence each."""
+
+    @property
+    def learning_episodes(self) -> tuple[TrainingEpisode, ...]:
+        """Those in which the agent acted; the random policy's have a length of their own and teach nothing yet."""
+        return tuple(e for e in self.episodes if e.policy_version >= 0)
 
     def series(self, key: str, axis: str = "env_steps") -> tuple[Points, Points]:
         """A metric over an axis: positions and values, without nulls and what a resume replaced."""

@@ -20,7 +20,8 @@ from matplotlib.figure import Figure
 
 from slotfilm_dist.envs.reward_bounds import largest_terms
 from slotfilm_dist.evaluation.figure_style import LINES, STYLE, steps_axis
-from slotfilm_dist.evaluation.record import RunRecord, TrainingEpisode
+from slotfilm_dist.evaluation.record import RunRecord
+from slotfilm_dist.messages import TrainingEpisode
 
 TABLE_TERMS = ("reach", "post_grasp", "place")
 """Components of Table 2 and Figure 9, in the paper's order."""
@@ -120,12 +121,12 @@ def draw_components(rows: Sequence[dict[str, Any]], path: Path) -> Path:
     return path
 
 
-def _episode_terms(record: RunRecord) -> tuple[list[TrainingEpisode], Shares, list[str]]:
+def _episode_terms(record: RunRecord) -> tuple[tuple[TrainingEpisode, ...], Shares, list[str]]:
     """Episodes that the learning policy played, steps at their ends, sums of their components, and those' names.
 
     The random policy's are left out: only the run that collected its data has them, not those that share it.
     """
-    own = [e for e in record.episodes if e.policy_version >= 0]
+    own = record.learning_episodes
     if not own:
         raise ValueError(f"{record.run_dir}: episodes.jsonl holds no training episode yet")
     names: list[str] = list(record.reward_term_names)

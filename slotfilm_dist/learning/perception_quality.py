@@ -41,6 +41,22 @@ class PerceptionQuality:
         return {name: value for name, value in values.items() if math.isfinite(value)}
 
 
+def strongest_slots(attention: Float[np.ndarray, "frames slots tokens"], count: int) -> list[int]:
+    """The slots with the highest mean peak of attention, in their own order (Figure 14)."""
+    peaks = attention.max(axis=2).mean(axis=0)
+    return sorted(np.argsort(-peaks, kind="stable")[:count].tolist())
+
+
+def only_slots(perception: Perception, slots: list[int], *, matched_visibility: bool) -> Perception:
+    """What these slots alone see."""
+    return Perception(
+        slots=perception.slots[:, slots],
+        attention=perception.attention[:, slots],
+        uv=perception.uv[:, slots],
+        visible_logits=perception.visible_logits[:, slots] if matched_visibility else perception.visible_logits,
+    )
+
+
 @torch.no_grad()
 def perception_quality(
     perception: Perception,
@@ -51,7 +67,10 @@ def perception_quality(
     image_size: int,
     matched_visibility: bool,
 ) -> PerceptionQuality:
-    """Compare what the network sees with the labels.
+    """Compare what the network sees with the labels: all its slots, of which none should be surplus.
+
+    A surplus slot would be chosen with the labels, as a guess at random is the nearer the more there are of it; leave
+    the `strongest_slots`, one an object, which needs no label (Section 7.3).
 
     Args:
         perception: of the frames.

@@ -12,7 +12,12 @@ from torch import Tensor, nn
 from slotfilm_dist.config import PretrainConfig
 from slotfilm_dist.learning.frames import PretrainFrames, mean_position, split_by_episode
 from slotfilm_dist.learning.perception_losses import pretrain_losses
-from slotfilm_dist.learning.perception_quality import PerceptionQuality, perception_quality
+from slotfilm_dist.learning.perception_quality import (
+    PerceptionQuality,
+    only_slots,
+    perception_quality,
+    strongest_slots,
+)
 from slotfilm_dist.learning.rows import Rows
 from slotfilm_dist.machine import takes_bfloat16
 from slotfilm_dist.nets.backbone import FEATURE_CHANNELS
@@ -152,8 +157,9 @@ class Pretrainer:
             uv=torch.cat([part.uv for part in parts]),
             visible_logits=torch.cat([part.visible_logits for part in parts]),
         )
+        counted = strongest_slots(perception.attention.cpu().numpy(), self.frames.uv.shape[1])
         return perception_quality(
-            perception,
+            only_slots(perception, counted, matched_visibility=self.network.matched_visibility),
             torch.from_numpy(self.frames.uv[self.eval_frames]).to(self.device),
             torch.from_numpy(self.frames.visible[self.eval_frames]).to(self.device),
             self._mean_position,

@@ -51,7 +51,8 @@ class Measurement:
     @property
     def way(self) -> tuple[object, ...]:
         """How it was made: measurements of different runs may stand side by side where this is the same."""
-        return self.folder.name, *self.options.items(), self.stage
+        own_frames = (self.run.path,) if self.options.get("--frames") == "agent" else ()  # nobody else's are the same
+        return self.folder.name, *self.options.items(), self.stage, *own_frames
 
 
 def measured(runs: Sequence[StudyRun], pattern: str) -> list[Measurement]:

@@ -86,7 +86,7 @@ class VariantNumbers:
 
 def training_returns(run: StudyRun) -> tuple[Episodes, Episodes]:
     """Steps at the end of each episode that the learning policy played, and its return at the paper's scale."""
-    own = [e for e in run.record.episodes if e.policy_version >= 0]
+    own = run.record.learning_episodes
     steps = np.array([e.env_steps for e in own], dtype=np.float64)
     return steps, SCALE * np.array([e.summary.episode_return for e in own], dtype=np.float64)
 

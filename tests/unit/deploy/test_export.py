@@ -105,7 +105,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory, write_agent_run: Callable
         formats = ("torch", "onnx") if variant in AS_ONNX else ("torch",)
         export_policy(run, folder / variant / "policy", formats=formats, tolerance=TOLERANCE)
         rng, inputs = np.random.default_rng(7), policy_inputs(learner.config)
-        drawn = [random_observation(inputs, rng) for _ in range(20)]
+        drawn = [random_observation(inputs, rng, learner.encoder) for _ in range(20)]
         observations = {name: np.stack([one[name] for one in drawn]) for name in inputs}
         actions = own_actions(learner, observations)
         np.savez(folder / variant / "observations.npz", **observations, action=actions)
@@ -182,7 +182,7 @@ def test_wrong_observation_is_refused(
     exported: Path, backend: str, change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]], complaint: str
 ) -> None:
     policy = load_policy(exported / "slotfilm_goal" / "policy", backend)
-    observation = random_observation(policy.inputs, np.random.default_rng(0))
+    observation = random_observation(policy.inputs, np.random.default_rng(0), altered("slotfilm_goal").encoder)
     with pytest.raises(ValueError, match=complaint):
         policy.act(**change(observation))
 
