@@ -1,8 +1,11 @@
 """Tells a person how a run is doing: one line that stays in place on a terminal, a line every few seconds elsewhere."""
 
+import contextlib
+import sys
 import time
+import typing
 from collections.abc import Mapping
-from typing import Literal
+from typing import Any, Literal, TextIO
 
 from rich.console import Console
 from rich.live import Live
@@ -24,6 +27,32 @@ def duration(seconds: float) -> str:
     return f"{minutes} min {whole % 60:02d} s" if minutes else f"{whole} s"
 
 
+class SteadyStderr:
+    """Standard error for a console whose loss must end nothing: a full disk, a closed terminal, a reader that died."""
+
+    def __init__(self) -> None:
+        self._file = getattr(sys.stderr, "rich_proxied_file", sys.stderr)
+
+    def write(self, text: str) -> int:
+        """Write what can be written."""
+        with contextlib.suppress(OSError):
+            self._file.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush if that is possible."""
+        with contextlib.suppress(OSError):
+            self._file.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+def steady_console(**options: Any) -> Console:
+    """A console on standard error that raises nothing."""
+    return Console(file=typing.cast(TextIO, SteadyStderr()), highlight=False, **options)
+
+
 class Progress:
     """Shows phase, share done, speed, and what matters of the metrics.
 
@@ -32,7 +61,7 @@ class Progress:
     """
 
     def __init__(self, console: Console | None = None) -> None:
-        self._console = console or Console(stderr=True, highlight=False)
+        self._console = console or steady_console()
         self._live: Live | None = None
         self._phase = ""
         self._started = self._printed = 0.0

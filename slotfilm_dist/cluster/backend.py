@@ -226,30 +226,24 @@ class RayBackend:
         return size
 
     def close(self) -> None:
-        """Stop workers, then the learner, then replay, then Ray."""
-        self._close_players()
-        if self._workforce is not None:
-            with contextlib.suppress(RoleLostError, RoleSilentError):
-                self._workforce.close()
-            self._workforce = None
-        if self._learner is not None:
-            with contextlib.suppress(RoleLostError, RoleSilentError):
-                self._learner.close()
-            self._learner = None
-        if self._inference is not None:
-            self._inference.kill()
-            self._inference = None
-        for shard in self._shards:
-            shard.kill()
-        self._shards = []
-        if self._hub is not None:
-            with contextlib.suppress(RoleLostError, RoleSilentError):
-                self._hub.close()
-            self._hub.kill()
-            self._hub = None
-        if self._session is not None:
-            self._session.close()
-            self._session = None
+        """Stop workers, then the learner, then replay, then Ray; each whatever becomes of the one before."""
+        with contextlib.ExitStack() as steps:  # the last one first
+            if self._session is not None:
+                steps.callback(self._session.close)
+            if self._hub is not None:
+                steps.callback(self._hub.kill)
+                steps.callback(_unless_lost, self._hub.close)
+            for shard in self._shards:
+                steps.callback(shard.kill)
+            if self._inference is not None:
+                steps.callback(self._inference.kill)
+            if self._learner is not None:
+                steps.callback(_unless_lost, self._learner.close)
+            if self._workforce is not None:
+                steps.callback(_unless_lost, self._workforce.close)
+            steps.callback(self._close_players)
+            self._session = self._hub = self._inference = self._learner = self._workforce = None
+            self._shards = []
 
     def want_workers(self, num_workers: int) -> None:
         """Ask for another number of workers; the caretaker starts or stops them."""
@@ -342,6 +336,12 @@ class RayBackend:
         if self._pool is not None:
             self._pool.close()
             self._pool = None
+
+
+def _unless_lost(close: Callable[[], object]) -> None:
+    """Close a role that may be gone already."""
+    with contextlib.suppress(RoleLostError, RoleSilentError):
+        close()
 
 
 def _wait(seconds: float, should_stop: Callable[[], bool]) -> None:

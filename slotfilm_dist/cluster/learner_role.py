@@ -146,7 +146,7 @@ class LearnerRole:
         """
         if self._loops is not None:
             self._loops.stop(timeout_s)
-        return self.learner.updates
+        return self._learner.updates if self._learner else 0
 
     def status(self) -> LearnerStatus:
         """How it does."""

@@ -269,11 +269,11 @@ def _run(
 
 def _outcome(options: "argparse.Namespace", grid: Path, jobs: "Sequence[Job]", ledger: "Ledger") -> int:
     """Say what has become of the trials; gives the exit code."""
-    from rich.console import Console
+    from slotfilm_dist.progress import steady_console
 
     records = [ledger.read(job) for job in jobs if job.kind == "trial"]
     failed = [record for record in records if record.state == "failed"]
-    console = Console(stderr=True, highlight=False)
+    console = steady_console()
     for record in failed:
         console.print(f"  failed  {record.key}: {record.error}", soft_wrap=True, markup=False)
     counts = Counter(record.state for record in records)

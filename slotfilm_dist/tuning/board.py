@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from slotfilm_dist.progress import PLAIN_EVERY_S, duration
+from slotfilm_dist.progress import PLAIN_EVERY_S, duration, steady_console
 from slotfilm_dist.tuning.jobs import Job
 from slotfilm_dist.tuning.ledger import JobState, Record
 
@@ -48,7 +48,7 @@ class Board:
     """
 
     def __init__(self, records: Sequence[tuple[Job, Record]], console: Console | None = None) -> None:
-        self._console = console or Console(stderr=True, highlight=False)
+        self._console = console or steady_console()
         self._live: Live | None = None
         self._drawn_at = self._said_at = time.monotonic()
         self.rows: dict[str, Row] = {}

@@ -9,6 +9,7 @@ The driver asks for an end with a file in the grid's directory, which every job 
 heavy machine gets as long as it needs for its checkpoint, and nothing depends on how Tune ends processes.
 """
 
+import contextlib
 import logging
 import os
 import shutil
@@ -92,7 +93,7 @@ def run_grid(todo: Sequence[Job], orders: Orders, limits: GridLimits, board: Boa
         tune_config=tune.TuneConfig(
             num_samples=len(todo),
             search_alg=JobQueue(todo, there, stop, driver.give_up),
-            scheduler=HalvingByReward(dict(orders.jobs)) if limits.asha else None,
+            scheduler=HalvingByReward(dict(orders.jobs), driver.mark_pruned) if limits.asha else None,
             max_concurrent_trials=limits.max_concurrent or None,
             reuse_actors=False,
             trial_name_creator=lambda trial: trial.config["key"],
@@ -140,15 +141,24 @@ class Driver(tune.Callback):
 
     def give_up(self, job: Job, reason: str) -> None:
         """A job that cannot begin."""
-        self._ledger.end(job, "failed", error=reason)
+        with contextlib.suppress(OSError):  # a full disk ends no other job; the next start tries this one again
+            self._ledger.end(job, "failed", error=reason)
         self._board.note(job.key, "failed", error=reason)
+
+    def mark_pruned(self, key: str) -> None:
+        """ASHA ends this trial: for good, where that can be written down, else until the next start."""
+        mark = self._orders.prune_mark(key)
+        with contextlib.suppress(OSError):
+            mark.parent.mkdir(exist_ok=True)
+            mark.touch()
 
     def on_step_begin(self, iteration: int, trials: list[Trial], **values: Any) -> None:
         """About ten times a second."""
         if self._stop() and not self._stopping_since:
-            self._stopping_since = time.monotonic()
-            (self._orders.grid / STOP_FILE).touch()
-            self._board.say(f"    stop  {self._board.counts['running']} jobs write their checkpoints and end")
+            with contextlib.suppress(OSError):  # on a full disk it is tried again, ten times a second
+                (self._orders.grid / STOP_FILE).touch()
+                self._stopping_since = time.monotonic()
+                self._board.say(f"    stop  {self._board.counts['running']} jobs write their checkpoints and end")
         self._board.refresh()
 
     def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **values: Any) -> None:
@@ -182,7 +192,8 @@ class Driver(tune.Callback):
     def _note_failure(self, trial: Trial, word: str) -> None:
         job = self._orders.jobs[trial.config["key"]]
         if self._ledger.read(job).state == "running":  # its process died before it could write anything
-            self._ledger.end(job, "failed", error=_cause(trial))
+            with contextlib.suppress(OSError):
+                self._ledger.end(job, "failed", error=_cause(trial))
         error = self._ledger.read(job).error or _cause(trial)
         self._board.note(job.key, "failed", error=error)
         self._board.say(f"  {word}  {job.key}: {error}")

@@ -40,8 +40,8 @@ class JobTrainable(Trainable):
         """Nothing: the run goes on from its own checkpoints."""
 
     def cleanup(self) -> None:
-        """Tune wants the process back. Work that is not over has been pruned, or was asked to stop before."""
-        self._work.prune()
+        """Tune wants the process back: ASHA has ended the trial, the driver stops, or it has failed."""
+        self._work.end()
         self._work.wait(CLEANUP_S)
 
 
@@ -105,11 +105,12 @@ class HalvingByReward(FIFOScheduler):
 
     Args:
         jobs: by key.
+        mark: told of a trial that is ended.
     """
 
-    def __init__(self, jobs: dict[str, Job]) -> None:
+    def __init__(self, jobs: dict[str, Job], mark: Callable[[str], None]) -> None:
         super().__init__()
-        self._jobs = jobs
+        self._jobs, self._mark = jobs, mark
         self._halvings: dict[str, AsyncHyperBandScheduler] = {}
 
     def on_trial_add(self, tune_controller: Any, trial: Trial) -> None:
@@ -120,7 +121,10 @@ class HalvingByReward(FIFOScheduler):
     def on_trial_result(self, tune_controller: Any, trial: Trial, result: dict[str, Any]) -> str:
         """Whether a trial goes on."""
         halving = self._halving(trial)
-        return halving.on_trial_result(tune_controller, trial, result) if halving else TrialScheduler.CONTINUE
+        decision = halving.on_trial_result(tune_controller, trial, result) if halving else TrialScheduler.CONTINUE
+        if decision == TrialScheduler.STOP:
+            self._mark(trial.config["key"])
+        return decision
 
     def on_trial_complete(self, tune_controller: Any, trial: Trial, result: dict[str, Any]) -> None:
         """A trial has ended; its last result stays in the comparison."""

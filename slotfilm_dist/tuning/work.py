@@ -12,11 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from slotfilm_dist.evaluation.record import read_run
 from slotfilm_dist.pipeline import Pipeline
-from slotfilm_dist.progress import Phase, Progress
+from slotfilm_dist.progress import Phase, Progress, steady_console
 from slotfilm_dist.runs import RunDirectory
 from slotfilm_dist.stopping import Interrupted, StopFlag
 from slotfilm_dist.tuning.jobs import Job
@@ -26,6 +24,8 @@ from slotfilm_dist.tuning.resources import TrialResources
 
 STOP_FILE = "stop"
 """In a grid's directory: its driver wants all jobs to write their checkpoints and end."""
+PRUNE_FOLDER = "pruned"
+"""In a grid's directory: a file for each trial that ASHA ended."""
 LOOK_S = 0.5
 """Seconds between two looks for the stop file."""
 
@@ -44,6 +44,10 @@ class Orders:
     make_backend: MakeBackend
     command: tuple[str, ...]
     """The words of the command that this is part of, for the runs' records."""
+
+    def prune_mark(self, key: str) -> Path:
+        """The file by which the driver tells a trial that ASHA has ended it."""
+        return self.grid / PRUNE_FOLDER / key
 
     def directory(self, job: Job) -> Path:
         """Where a job's run lives."""
@@ -78,10 +82,10 @@ class StopFile(StopFlag):
         self()
         super().check()
 
-    def prune(self) -> None:
-        """Ask for the end of a trial that is not worth its time."""
+    def end(self, *, pruned: bool) -> None:
+        """Ask for the end of a job, a final one if this trial is not worth its time."""
         if not self.signal_number:
-            self.pruned = not self._path.exists()
+            self.pruned = pruned and not self._path.exists()
             self.signal_number = signal.SIGTERM
 
 
@@ -89,7 +93,7 @@ class Standing(Progress):
     """Keeps how far a job is, to be asked for from another thread, and writes sentences to the process's log."""
 
     def __init__(self) -> None:
-        super().__init__(Console(file=sys.stderr, highlight=False, force_terminal=False))
+        super().__init__(steady_console(force_terminal=False))
         self.now: dict[str, Any] = {"phase": "start", "share": 0.0}
 
     def say(self, text: str) -> None:
@@ -146,9 +150,9 @@ class Work:
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
-    def prune(self) -> None:
-        """Ask for an end that is final, unless the grid as a whole is being stopped."""
-        self._stop.prune()
+    def end(self) -> None:
+        """Ask for an end. It is final where ASHA decided so; any other end, an error of the driver too, is a stop."""
+        self._stop.end(pruned=self._orders.prune_mark(self._job.key).exists())
 
     def standing(self) -> dict[str, Any]:
         """How far it is, as plain values; raises what the job failed with."""
@@ -160,6 +164,7 @@ class Work:
         job, ledger = self._job, self._ledger
         try:
             self._stop.check()
+            self._orders.prune_mark(job.key).unlink(missing_ok=True)
             ledger.begin(job)
             self._go_through()
             result = _result(self._orders.directory(job)) if job.kind == "trial" else {}

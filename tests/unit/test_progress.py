@@ -1,6 +1,9 @@
 """What a person sees of a run."""
 
 import io
+import os
+import subprocess
+import sys
 
 import pytest
 from rich.console import Console
@@ -55,3 +58,26 @@ def test_brackets_in_paths_and_errors_are_shown_as_they_are() -> None:
     output = io.StringIO()
     Progress(Console(file=output, width=200)).say("--resume '/runs/exp[gpu]/x': [enforce fail at a.cpp] [/]")
     assert output.getvalue() == "--resume '/runs/exp[gpu]/x': [enforce fail at a.cpp] [/]\n"
+
+
+def test_lost_standard_error_ends_nothing() -> None:
+    code = """
+import os, sys
+from slotfilm_dist.progress import Progress
+progress = Progress()
+progress.begin("train", "something")
+progress.say("a sentence " * 10_000)
+for done in range(3):
+    progress.show(done, 3, {})
+progress.end("over")
+print("alive")
+"""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open("/dev/full", "wb") as full:
+        for stderr in (full, writing):
+            done = subprocess.run(
+                [sys.executable, "-P", "-c", code], stderr=stderr, stdout=subprocess.PIPE, check=False
+            )
+            assert done.stdout == b"alive\n"
+    os.close(writing)

@@ -74,7 +74,8 @@ def test_nothing_is_handed_out_after_a_stop() -> None:
 
 def test_halving_compares_within_a_reward_only() -> None:
     jobs = build_jobs(build_trials(smoke(), ["state_only", "no_state", "slotfilm", "alpha_5"], 1))
-    halving = HalvingByReward({job.key: job for job in jobs})
+    marked: list[str] = []
+    halving = HalvingByReward({job.key: job for job in jobs}, marked.append)
     trials = [Trial("job", trial_id=job.key, config={"key": job.key}, stub=True) for job in jobs]
 
     def decide(trial: Trial, episode_return: float) -> str:
@@ -90,3 +91,4 @@ def test_halving_compares_within_a_reward_only() -> None:
     assert decide(alpha_5, 0.1) == TrialScheduler.CONTINUE
     assert decide(data, 0.0) == TrialScheduler.CONTINUE
     assert halving.on_trial_result(None, state_only, {"phase": "evaluate"}) == TrialScheduler.CONTINUE
+    assert marked == [no_state.config["key"]]

@@ -100,9 +100,12 @@ def test_failure_is_raised_and_recorded(tmp_path: Path) -> None:
     assert "Traceback" in record.trace
 
 
-@pytest.mark.parametrize(("pruned", "state", "keeps_replay"), [(False, "stopped", True), (True, "pruned", False)])
+@pytest.mark.parametrize(
+    ("by", "state", "keeps_replay"),
+    [("signal", "stopped", True), ("asha", "pruned", False), ("an error of the driver", "stopped", True)],
+)
 def test_stop_keeps_replay_for_later_and_pruning_drops_it(
-    tmp_path: Path, pruned: bool, state: str, keeps_replay: bool
+    tmp_path: Path, by: str, state: str, keeps_replay: bool
 ) -> None:
     jobs = jobs_of(total_steps=100_000)
     orders = orders_for(tmp_path, jobs)
@@ -114,10 +117,13 @@ def test_stop_keeps_replay_for_later_and_pruning_drops_it(
             break
         assert not work.wait(0.05)
     assert training.is_set()
-    if pruned:
-        work.prune()
-    else:
+    if by == "signal":
         (orders.grid / STOP_FILE).touch()
+    if by == "asha":
+        orders.prune_mark(jobs[-1].key).parent.mkdir()
+        orders.prune_mark(jobs[-1].key).touch()
+    if by != "signal":
+        work.end()
     assert work.wait(LIMIT_S)
     assert work.standing()["state"] == Ledger(orders.grid).read(jobs[-1]).state == state
     checkpoints = orders.directory(jobs[-1]) / "checkpoints"
@@ -131,7 +137,7 @@ def test_pruning_while_the_grid_stops_is_a_stop(tmp_path: Path) -> None:
     orders.grid.mkdir()
     (orders.grid / STOP_FILE).touch()
     work = work_on(jobs[-1], orders)
-    work.prune()
+    work.end()
     assert work.wait(LIMIT_S)
     assert Ledger(orders.grid).read(jobs[-1]).state == "stopped"
 
