@@ -19,9 +19,17 @@ class Role(IntEnum):
     EVALUATION = 8
 
 
-def role_seed(seed: int, role: Role, worker: int = 0, incarnation: int = 0) -> np.random.SeedSequence:
-    """The stream of one role; a restarted worker (next incarnation) never repeats what it drew before."""
-    return np.random.SeedSequence(seed, spawn_key=(int(role), worker, incarnation))
+def role_seed(seed: int, role: Role, worker: int = 0, incarnation: int = 0, already: int = 0) -> np.random.SeedSequence:
+    """The stream of one role; a restarted worker (next incarnation) never repeats what it drew before.
+
+    Args:
+        seed: of the run.
+        role: who draws.
+        worker: number of the worker.
+        incarnation: how often it had been restarted.
+        already: steps that are there, where a collection goes on that another run may have begun.
+    """
+    return np.random.SeedSequence(seed, spawn_key=(int(role), worker, incarnation, *((already,) if already else ())))
 
 
 def role_number(seed: int, role: Role) -> int:

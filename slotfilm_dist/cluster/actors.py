@@ -135,8 +135,8 @@ class WorkerActor:
     def train(self, incarnation: int, hub: Any, store: Any, agent: Any) -> None:
         self._loop.train(incarnation, hub, store, agent)
 
-    def collect_randomly(self, incarnation: int) -> None:
-        self._loop.collect_randomly(incarnation)
+    def collect_randomly(self, incarnation: int, already: int) -> None:
+        self._loop.collect_randomly(incarnation, already)
 
     def describe(self, timeout_s: float) -> tuple[int, tuple[str, ...]] | None:
         return self._loop.describe(timeout_s)

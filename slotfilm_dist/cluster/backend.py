@@ -112,7 +112,7 @@ class RayBackend:
     def random_blocks(self, num_steps: int, start: int) -> Iterator[TransitionBlock]:
         """Blocks of the random policy from all workers; a continued collection has random streams of its own."""
         self.enter()
-        yield from self._workers.random_blocks(num_steps)
+        yield from self._workers.random_blocks(num_steps, start)
 
     def pretrain(self, dataset: Path, artifact: Path) -> Iterator[dict[str, float]]:
         """Pre-train in the learner's process, continuing what an interrupted pre-training left."""

@@ -57,10 +57,10 @@ class WorkerClient:
         self._last = None
         self._link.begin("train", incarnation, hub, store, agent)
 
-    def collect_randomly(self, incarnation: int) -> None:
+    def collect_randomly(self, incarnation: int, already: int) -> None:
         """Start collecting with the random policy; does not wait."""
         self._last = None
-        self._link.begin("collect_randomly", incarnation)
+        self._link.begin("collect_randomly", incarnation, already)
 
     def describe(self, timeout_s: float) -> tuple[int, tuple[str, ...]] | None:
         """Size of an action and the reward's terms, or None while the environment is being built."""

@@ -124,8 +124,11 @@ class Supervisor:
         self._stopped = False
         self.restarts: Counter[str] = Counter()
         self._rejected_before = self._cut_before = 0
+        self._failures_of_held: dict[int, list[float]] = {}
         self.num_held = 0
         """Workers that should run and stand still."""
+        self.num_surplus = 0
+        """Those of them with higher numbers than all that run: what one could do without."""
 
     @property
     def num_alive(self) -> int:
@@ -166,11 +169,12 @@ class Supervisor:
             shares = self._memory_shares()
             for worker_id in range(num_workers):
                 if worker_id not in self._members and self._guard.may_run(worker_id, shares):
-                    self._start(worker_id, [])
+                    self._start(worker_id, self._failures_of_held.pop(worker_id, []))
             self._dismiss([worker_id for worker_id in self._members if worker_id >= num_workers])
             if num_workers and not self._members:
-                self._start(0, [])
+                self._start(0, self._failures_of_held.pop(0, []))
             self.num_held = num_workers - len(self._members)
+            self.num_surplus = num_workers - 1 - max(self._members, default=num_workers - 1)
 
     def employ_again(self) -> None:
         """Stop all loops and set the workers to work anew, as `employ` now means it; their environments stay."""
@@ -230,16 +234,20 @@ class Supervisor:
     def _replace(self, member: _Member, reason: str, cause: str) -> None:
         worker_id, now = member.handle.worker_id, self._clock()
         share = member.beat.memory_share if member.beat is not None else self._memory_share()
+        # A process that is gone without a word was ended by the system, most likely, where memory is short.
+        silent = member.beat is None or not member.beat.error
+        by_system = silent and reason in ("crash", "memory") and self._guard.is_short(share)
         member.handle.kill()
         self._settle(worker_id, member.incarnation)
         self._retire(member)
-        if reason in ("crash", "memory") and self._guard.is_short(share):  # the system ended it, most likely
+        failures = [at for at in member.failures if now - at <= FAILURE_WINDOW_S] + [now]
+        if by_system and len(failures) < MAX_FAILURES:
             del self._members[worker_id]
+            self._failures_of_held[worker_id] = failures
             self._hold(worker_id, share)
             return
         self.restarts[reason] += 1
         _logger.warning("worker %d is replaced (%s): %s", worker_id, reason, cause)
-        failures = [at for at in member.failures if now - at <= FAILURE_WINDOW_S] + [now]
         if len(failures) >= MAX_FAILURES:
             raise RunFailedError(
                 f"worker {worker_id} failed {len(failures)} times within {now - failures[0]:.0f} s without collecting "

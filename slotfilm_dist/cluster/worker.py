@@ -105,14 +105,15 @@ class WorkerLoop:
         self._waited_s = self._step_s = 0.0
         self._error = self._error_reason = ""
 
-    def collect_randomly(self, incarnation: int) -> None:
-        """Start collecting with the random policy; `take_random_blocks` fetches the blocks."""
+    def collect_randomly(self, incarnation: int, already: int) -> None:
+        """Start collecting with the random policy, after `already` steps; `take_random_blocks` fetches the blocks."""
         mailbox = self._mailbox = Mailbox(2)
 
         def policy(action_dim: int) -> Policy:
-            return RandomPolicy(action_dim, self._seed(Role.RANDOM_ACTIONS, incarnation))
+            return RandomPolicy(action_dim, self._seed(Role.RANDOM_ACTIONS, incarnation, already))
 
-        self._start(incarnation, mailbox, policy, Role.RANDOM_EPISODES, self._config.random_episode_length)
+        episodes = self._seed(Role.RANDOM_EPISODES, incarnation, already)
+        self._start(incarnation, mailbox, policy, episodes, self._config.random_episode_length)
 
     def take_random_blocks(self, timeout_s: float) -> list[TransitionBlock]:
         """Blocks of the random policy, at least one unless time runs out."""
@@ -140,7 +141,8 @@ class WorkerLoop:
             )
             return acting
 
-        self._start(incarnation, sender, policy, Role.EPISODES, self._config.env.max_steps)
+        episodes = self._seed(Role.EPISODES, incarnation)
+        self._start(incarnation, sender, policy, episodes, self._config.env.max_steps)
 
     def describe(self, timeout_s: float) -> tuple[int, tuple[str, ...]] | None:
         """Size of an action and names of the reward's terms, or None while the environment is being built."""
@@ -180,15 +182,15 @@ class WorkerLoop:
             ended=self._ended == self._incarnation,
         )
 
-    def _seed(self, role: Role, incarnation: int) -> np.random.SeedSequence:
-        return role_seed(self._config.seed, role, self._worker_id, incarnation)
+    def _seed(self, role: Role, incarnation: int, already: int = 0) -> np.random.SeedSequence:
+        return role_seed(self._config.seed, role, self._worker_id, incarnation, already)
 
     def _start(
         self,
         incarnation: int,
         outlet: Outlet,
         make_policy: Callable[[int], Policy],
-        episodes: Role,
+        episodes: np.random.SeedSequence,
         episode_steps: int,
     ) -> None:
         assert self._thread is None or not self._thread.is_alive(), "stop comes first"
@@ -200,7 +202,7 @@ class WorkerLoop:
         self._note("starting", self._limits.build_s)
         self._thread = threading.Thread(
             target=self._run,
-            args=(outlet, make_policy, self._seed(episodes, incarnation), episode_steps),
+            args=(outlet, make_policy, episodes, episode_steps),
             name=f"worker-{self._worker_id}",
             daemon=True,
         )

@@ -74,6 +74,7 @@ class Workforce:
         self._agent: AgentSetup | InferenceClient | None = None
         self._scaler = WorkerScaler(max_workers=config.runtime.max_workers, worker_cpus=share_cpus)
         self._launched: set[int] = set()
+        self._already = 0
         self._failure: RunFailedError | None = None
         self._closing = threading.Event()
         self.watch: ShardWatch | None = None
@@ -105,8 +106,11 @@ class Workforce:
                         return described
             time.sleep(TICK_S / 10)
 
-    def random_blocks(self, num_steps: int) -> Iterator[TransitionBlock]:
-        """The random policy's blocks, as they come from any worker."""
+    def random_blocks(self, num_steps: int, already: int) -> Iterator[TransitionBlock]:
+        """The random policy's blocks, as they come from any worker, after `already` steps that are there."""
+        if already != self._already:  # what the workers began with may be what is there
+            self._already = already
+            self.supervisor.employ_again()
         requests: dict[WorkerClient, Any] = {}
         done = 0
         while done < num_steps:
@@ -140,7 +144,8 @@ class Workforce:
         if not (counts.auto_workers and self.training):
             return
         if self.supervisor.num_held:  # there is no memory for so many
-            self._hub.adapt_workers(max(1, counts.wanted_workers - self.supervisor.num_held))
+            if self.supervisor.num_surplus:
+                self._hub.adapt_workers(counts.wanted_workers - self.supervisor.num_surplus)
             return
         load = Load(
             at_s=time.monotonic(),
@@ -190,7 +195,7 @@ class Workforce:
 
     def _employ(self, handle: Any, incarnation: int) -> None:
         if self._agent is None:
-            handle.collect_randomly(incarnation)
+            handle.collect_randomly(incarnation, self._already)
             return
         seed = role_seed(self._config.seed, Role.REPLAY, INSERT_STREAMS + handle.worker_id, incarnation)
         handle.train(incarnation, self._hub, ReplayClient(self._shards, seed), self._agent)

@@ -169,7 +169,7 @@ class Machine:
         self.handles: dict[int, Handle] = {}
         self.employed: list[tuple[int, int]] = []
         self.settled: list[tuple[int, int]] = []
-        self.lost_steps = 0
+        self.lost_steps, self.num_blocks = 0, 1
         self.supervisor = Supervisor(
             self._launch,
             self._employ,
@@ -199,7 +199,7 @@ class Machine:
     def _employ(self, handle: object, incarnation: int) -> None:
         assert isinstance(handle, Handle)
         self.employed.append((handle.worker_id, incarnation))
-        handle.beat = working(handle.worker_id, incarnation, self.share)
+        handle.beat = replace(working(handle.worker_id, incarnation, self.share), num_blocks=self.num_blocks)
 
     def _settle(self, worker_id: int, incarnation: int) -> int:
         self.settled.append((worker_id, incarnation))
@@ -238,6 +238,45 @@ def test_worker_that_the_system_ended_for_its_memory_stands_still_and_is_no_fail
     assert dict(machine.supervisor.restarts).keys() == {"memory"}
     machine.share = 0.5
     assert machine.run(2, LONGEST_HOLD_S) == 2
+
+
+def test_error_that_a_worker_tells_is_no_lack_of_memory_however_full_its_machine_is(machine: Machine) -> None:
+    machine.share, machine.num_blocks = 0.97, 0
+
+    def fail_again_and_again() -> None:
+        for _ in range(3 * MAX_FAILURES):
+            for handle in machine.handles.values():
+                if handle.beat is not None:
+                    handle.beat = replace(handle.beat, num_blocks=0, running=False, error="no Vulkan driver")
+            machine.run(2, 1.0)
+
+    with pytest.raises(RunFailedError, match="no Vulkan driver"):
+        fail_again_and_again()
+
+
+def test_only_worker_that_the_system_ends_again_and_again_before_it_collects_ends_the_run(machine: Machine) -> None:
+    machine.share, machine.num_blocks = 0.97, 0
+    machine.run(1, 0.5)
+
+    def lose_again_and_again() -> None:
+        for _ in range(3 * MAX_FAILURES):
+            for handle in machine.handles.values():
+                handle.beat, handle.lost = None, RoleLostError("worker", "crash", "killed")
+            machine.run(1, 1.0)
+
+    with pytest.raises(RunFailedError, match="killed"):
+        lose_again_and_again()
+
+
+def test_one_can_do_without_held_workers_only_where_none_of_a_higher_number_runs(machine: Machine) -> None:
+    assert machine.run(4) in (2, 4)
+    assert machine.run(4) == 4
+    machine.share = 0.97
+    machine.run(4, 1.5)
+    assert (machine.supervisor.num_held, machine.supervisor.num_surplus) == (1, 1)
+    machine.handles[0].lost = RoleLostError("worker", "crash", "killed")
+    machine.run(4)
+    assert (machine.supervisor.num_held, machine.supervisor.num_surplus) == (2, 1)
 
 
 def test_crash_with_room_is_a_failure(machine: Machine) -> None:
