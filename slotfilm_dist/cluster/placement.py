@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from slotfilm_dist.config import RunConfig
-from slotfilm_dist.replay.memory import check_memory
+from slotfilm_dist.replay.memory import check_memory, replay_bytes
 
 SHARES = (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.02, 0.01)
 """Cores that a role may ask for. Below 1, roles share cores: a laptop runs everything, only slower."""
@@ -51,6 +51,7 @@ def plan(config: RunConfig, nodes: Sequence[Mapping[str, float]]) -> Placement:
     """
     if memory := sum(node.get("memory", 0.0) for node in nodes):
         check_memory(config, int(memory))
+        _check_shards(config, nodes_for(nodes, STATE_RESOURCE))
     num_gpus = sum(node.get("GPU", 0.0) for node in nodes)
     wants_gpu = config.runtime.device == "cuda"
     if wants_gpu and num_gpus < 1:
@@ -82,6 +83,19 @@ def plan(config: RunConfig, nodes: Sequence[Mapping[str, float]]) -> Placement:
         f"runtime.num_workers = {config.runtime.num_workers}: this Ray cluster has {sum(cpus):g} cores; "
         f"it holds at most {max(0, math.floor(sum(cpus) / SHARES[-1]) - OTHER_ROLES)} workers"
     )
+
+
+def _check_shards(config: RunConfig, nodes: Sequence[Mapping[str, float]]) -> None:
+    """Raise ``ValueError`` if the shards, each on one node, find no room though their sum would."""
+    steps, num_shards = min(config.replay.capacity, config.schedule.total_steps), config.replay.num_shards
+    shard_bytes = replay_bytes(config, steps) / num_shards
+    memory = [node.get("memory", 0.0) for node in nodes]
+    if sum(int(each // shard_bytes) for each in memory) < num_shards:
+        raise ValueError(
+            f"replay.num_shards = {num_shards}: a shard takes {shard_bytes / 1e9:.1f} GB, and the nodes for it have "
+            f"{', '.join(f'{each / 1e9:.1f}' for each in memory)} GB; set --replay.num_shards higher or "
+            "--replay.capacity lower"
+        )
 
 
 def check_grown(nodes: Sequence[Mapping[str, float]]) -> None:

@@ -230,7 +230,7 @@ def _run(
     from slotfilm_dist.tuning.board import Board
     from slotfilm_dist.tuning.grid import GridLimits, jobs_to_do, run_grid
     from slotfilm_dist.tuning.places import make_backend
-    from slotfilm_dist.tuning.resources import check_fits
+    from slotfilm_dist.tuning.resources import check_fits, num_that_fit
     from slotfilm_dist.tuning.work import Orders
 
     artifacts = Path(options.artifacts).resolve()
@@ -246,6 +246,12 @@ def _run(
         todo = jobs_to_do(placed, ledger, artifacts)
         for job in todo if session.private else ():
             check_fits(job.key, resources[job.key], nodes)
+        homeless = {job.key for job in todo if not num_that_fit(resources[job.key], nodes)}
+        if homeless:
+            board.say(
+                f"    grid  no node of this cluster has room for {', '.join(sorted(homeless))}: they wait for larger "
+                "nodes, one at a time, while the others run; `--dry-run` shows what each asks for"
+            )
         orders = Orders(
             grid=grid,
             artifacts=artifacts,
@@ -257,7 +263,7 @@ def _run(
         board.say(f"slotfilm  grid of {sum(job.kind == 'trial' for job in jobs)} trials: {grid}")
         limits = GridLimits(num_retries=options.retries, max_concurrent=options.max_concurrent, asha=options.asha)
         with stop.listening():
-            run_grid(todo, orders, limits, board, stop)
+            run_grid(todo, orders, limits, board, stop, homeless)
             stop.check()
     except Interrupted as interruption:
         board.say(f"{interruption}; go on with the same command: {shlex.join(('slotfilm', *command))}")

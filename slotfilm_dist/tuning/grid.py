@@ -14,7 +14,7 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,7 +67,14 @@ def jobs_to_do(jobs: Sequence[Job], ledger: Ledger, artifacts: Path) -> list[Job
     return [*made, *trials]
 
 
-def run_grid(todo: Sequence[Job], orders: Orders, limits: GridLimits, board: Board, stop: Callable[[], bool]) -> None:
+def run_grid(
+    todo: Sequence[Job],
+    orders: Orders,
+    limits: GridLimits,
+    board: Board,
+    stop: Callable[[], bool],
+    homeless: Set[str] = frozenset(),
+) -> None:
     """Do these jobs on the Ray cluster that this process is connected to; the ledger and the board tell the outcome.
 
     Args:
@@ -76,6 +83,7 @@ def run_grid(todo: Sequence[Job], orders: Orders, limits: GridLimits, board: Boa
         limits: how.
         board: shows it.
         stop: asked ten times a second; the jobs write their checkpoints and end once it holds.
+        homeless: keys of jobs that no node has room for as the cluster is.
     """
     (orders.grid / STOP_FILE).unlink(missing_ok=True)
     shutil.rmtree(orders.grid / TUNE_FOLDER, ignore_errors=True)
@@ -92,7 +100,7 @@ def run_grid(todo: Sequence[Job], orders: Orders, limits: GridLimits, board: Boa
         trainable,
         tune_config=tune.TuneConfig(
             num_samples=len(todo),
-            search_alg=JobQueue(todo, there, stop, driver.give_up),
+            search_alg=JobQueue(todo, there, stop, driver.give_up, homeless),
             scheduler=HalvingByReward(dict(orders.jobs), driver.mark_pruned) if limits.asha else None,
             max_concurrent_trials=limits.max_concurrent or None,
             reuse_actors=False,

@@ -1,6 +1,6 @@
 """The order of a grid's jobs for Ray Tune: an artifact before the trials that need it, and nothing after a stop."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from typing import Any
 
 from ray.tune import Trainable
@@ -53,12 +53,20 @@ class JobQueue(Searcher):
         there: keys of artifacts that exist.
         stop: no job is handed out after it.
         give_up: told of a job that cannot begin, and why.
+        homeless: keys of jobs that no node of the cluster has room for as it is. They are handed out one at a time, for
+            a cluster that grows by what waits: more of them would block those that fit.
     """
 
     def __init__(
-        self, jobs: Sequence[Job], there: set[str], stop: Callable[[], bool], give_up: Callable[[Job, str], None]
+        self,
+        jobs: Sequence[Job],
+        there: set[str],
+        stop: Callable[[], bool],
+        give_up: Callable[[Job, str], None],
+        homeless: Set[str] = frozenset(),
     ) -> None:
         super().__init__()
+        self._homeless = homeless
         self._waiting = list(jobs)
         self._there = set(there)
         self._lost: set[str] = set()
@@ -74,11 +82,14 @@ class JobQueue(Searcher):
                 self._waiting.remove(job)
                 self._lost.add(job.key)
                 self._give_up(job, f"{missing[0]} could not be made")
-            elif self._there.issuperset(job.needs):
+            elif self._there.issuperset(job.needs) and not self._is_one_too_many(job):
                 self._waiting.remove(job)
                 self._given[trial_id] = job
                 return {"key": job.key}
         return None if self._waiting else Searcher.FINISHED
+
+    def _is_one_too_many(self, job: Job) -> bool:
+        return job.key in self._homeless and any(given.key in self._homeless for given in self._given.values())
 
     def on_trial_complete(self, trial_id: str, result: dict[str, Any] | None = None, error: bool = False) -> None:
         """A job has ended."""

@@ -1,5 +1,6 @@
 """What a trial asks of the cluster: a placement group for its roles, or one bundle for a run in one process."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -135,6 +136,8 @@ def num_that_fit(resources: TrialResources, nodes: Nodes) -> int:
     if resources.num_gpus and not any("GPU" in node for node in nodes):
         return 0
     bundles = resources.bundles
+    if not all(any(_holds(node, bundle) for node in nodes) for bundle in bundles):
+        return 0
     for_state = bundles if len(bundles) == 1 else bundles[:2]
     for_workers = bundles[len(for_state) :]
     groups = ((nodes, bundles), (nodes_for(nodes, STATE_RESOURCE), for_state))
@@ -152,6 +155,13 @@ def check_fits(key: str, resources: TrialResources, nodes: Nodes) -> None:
         f"{key} asks for {resources.num_cpus:g} cores, {resources.num_gpus:g} GPUs and "
         f"{resources.memory_bytes / 1e9:.1f} GB of memory; the cluster has {cores:g}, {gpus:g} and {memory / 1e9:.1f} "
         "GB. Give --cpus-per-trial or --gpus-per-trial a smaller number, or set --replay.capacity lower"
+    )
+
+
+def _holds(node: Mapping[str, float], bundle: Mapping[str, float]) -> bool:
+    """Whether a node, empty, has room for a bundle, which lies on one node; memory that it does not tell is enough."""
+    return all(
+        node.get(name, math.inf if name == "memory" else 0.0) + 1e-6 >= wanted for name, wanted in bundle.items()
     )
 
 

@@ -1,7 +1,9 @@
 """The KubeRay manifests and the container recipe, field by field."""
 
+import json
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,9 @@ import pytest
 import yaml
 
 from slotfilm_dist.cluster.placement import STATE_RESOURCE, WORKER_RESOURCE
+from slotfilm_dist.presets import steady
+from slotfilm_dist.tuning.jobs import build_jobs, build_trials, select_variants
+from slotfilm_dist.tuning.resources import job_resources, num_that_fit, runs_on_ray
 
 ROOT = Path(__file__).parents[2]
 KUBERAY = ROOT / "ops" / "kuberay"
@@ -191,3 +196,24 @@ def test_recipe_installs_what_is_pinned_and_ends_as_a_plain_user() -> None:
     assert "mesa-vulkan-drivers" in RECIPE.split("AS cpu\n")[1]
     copied = re.findall(r"^COPY (?!--from)(?:--chown=\S+ )?(.+) \S+$", RECIPE, re.MULTILINE)
     assert all((ROOT / source).exists() for line in copied for source in line.split())
+
+
+def test_every_trial_of_the_grid_finds_a_node_that_holds_it() -> None:
+    spec = JOB["spec"]["rayClusterSpec"]
+    nodes = [_as_ray_sees(group) for group in spec["workerGroupSpecs"]]
+    words = shlex.split(JOB["spec"]["entrypoint"])
+    assert words[:3] == ["python", "jobs/grid.py", "steady"]
+    gpus = float(words[words.index("--gpus-per-trial") + 1])
+    for job in build_jobs(build_trials(steady(), select_variants([], []), 1)):
+        mode = "ray" if runs_on_ray(job.config, nodes) else "local"
+        job = replace(job, config=replace(job.config, runtime=replace(job.config.runtime, mode=mode)))
+        given = job_resources(job, nodes, gpus_per_trial=gpus)
+        assert num_that_fit(given, nodes), f"{job.key} asks for {given.bundles}"
+
+
+def _as_ray_sees(group: dict[str, Any]) -> dict[str, float]:
+    limits = container_of(group["template"])["resources"]
+    own = json.loads(json.loads(group["rayStartParams"].get("resources", '"{}"')))
+    memory = {"Gi": 1 << 30}[limits["limits"]["memory"][-2:]] * int(limits["limits"]["memory"][:-2])
+    gpus = {"GPU": float(limits["limits"]["nvidia.com/gpu"])} if "nvidia.com/gpu" in limits["limits"] else {}
+    return {"CPU": float(limits["requests"]["cpu"]), "memory": float(memory), **gpus, **own}

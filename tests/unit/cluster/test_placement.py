@@ -14,7 +14,7 @@ from slotfilm_dist.cluster.placement import (
     plan,
 )
 from slotfilm_dist.config import RunConfig
-from slotfilm_dist.presets import smoke
+from slotfilm_dist.presets import cluster, smoke
 from slotfilm_dist.variants import apply_variant
 
 
@@ -90,3 +90,11 @@ def test_cluster_whose_nodes_have_yet_to_join_is_refused(nodes: list[dict[str, f
         check_grown(nodes)
     check_grown([*nodes, {"CPU": 4.0, STATE_RESOURCE: 1.0}])
     check_grown([*nodes, {"CPU": 4.0}])
+
+
+def test_shard_must_fit_onto_one_node_not_onto_the_sum_of_all() -> None:
+    config = apply_variant("cnn", cluster())
+    nodes = [{"CPU": 16.0, "memory": memory * 1e9} for memory in (34, 26, 20)]
+    assert plan(config, nodes).share_cpus > 0
+    with pytest.raises(ValueError, match=r"replay\.num_shards = 2: a shard takes 25\.\d GB, .* 34\.0, 20\.0, 20\.0 GB"):
+        plan(config, [{"CPU": 16.0, "memory": memory * 1e9} for memory in (34, 20, 20)])

@@ -1,3 +1,5 @@
+from collections.abc import Set
+
 from ray.tune.experiment import Trial
 from ray.tune.schedulers import TrialScheduler
 from ray.tune.search import Searcher
@@ -10,11 +12,11 @@ from slotfilm_dist.tuning.queue import HalvingByReward, JobQueue
 class Asked:
     """A queue with names for what it hands out."""
 
-    def __init__(self, jobs: list[Job], there: set[str] | None = None) -> None:
+    def __init__(self, jobs: list[Job], there: set[str] | None = None, homeless: Set[str] = frozenset()) -> None:
         self.stopped = False
         self.given_up: dict[str, str] = {}
         self.queue = JobQueue(
-            jobs, there or set(), lambda: self.stopped, lambda job, why: self.given_up.update({job.key: why})
+            jobs, there or set(), lambda: self.stopped, lambda job, why: self.given_up.update({job.key: why}), homeless
         )
 
     def next(self) -> str | None:
@@ -64,6 +66,15 @@ def test_lost_artifact_takes_its_trials_along_and_no_others() -> None:
         slotfilm.key: f"{slotfilm.needs[0]} could not be made",
     }
     assert asked.next() == Searcher.FINISHED
+
+
+def test_jobs_that_no_node_holds_are_handed_out_one_at_a_time() -> None:
+    jobs = build_jobs(build_trials(smoke(), ["state_only"], 4))
+    trials = [job.key for job in jobs if job.kind == "trial"]
+    asked = Asked(jobs[-4:], {key for job in jobs for key in job.needs}, homeless={*trials[:3]})
+    assert [asked.next(), asked.next(), asked.next()] == [trials[0], trials[3], None]
+    asked.done(trials[0])
+    assert [asked.next(), asked.next()] == [trials[1], None]
 
 
 def test_nothing_is_handed_out_after_a_stop() -> None:
