@@ -15,6 +15,7 @@ from slotfilm_dist.envs.reward import num_reward_inputs
 from slotfilm_dist.episodes import episode_metrics
 from slotfilm_dist.evaluation.page import write_page
 from slotfilm_dist.evaluation.record import AGENT, Evaluation, save_evaluation, summarize
+from slotfilm_dist.learning.checkpoint import CheckpointStore
 from slotfilm_dist.learning.learner import dataset_hash, dataset_schema, pretrain_hash
 from slotfilm_dist.messages import EpisodeSummary, TrainingEpisode
 from slotfilm_dist.metrics import phase_index
@@ -169,7 +170,9 @@ class Pipeline:
         self._progress.begin("train", f"{config.variant}: {total} environment steps in all")
         resumed = self._run.checkpoints if any(self._run.checkpoints.glob("updates-*")) else None
         values = self._backend.begin_training(dataset, pretrained, resumed)
-        self._best = float(values.get("best_return", float("-inf")))
+        # A run that goes on from an older checkpoint may have written a better `best` since.
+        best = CheckpointStore(self._run.checkpoints, config.checkpoint.keep).best_values()
+        self._best = max(float(known.get("best_return", float("-inf"))) for known in (values, best))
         next_evaluation = int(
             values.get("next_evaluation", config.schedule.random_steps + config.evaluation.every_steps)
         )
@@ -214,8 +217,9 @@ class Pipeline:
             return
         self._write("train", report.env_steps, report.updates, self._evaluation_metrics(result))
         if result.mean_return > self._best:
-            self._best = result.mean_return
-            metrics, problem = self._saver.save(report, {"best_return": self._best}, with_replay=False, best=True)
+            values = {"best_return": result.mean_return}
+            metrics, problem = self._saver.save(report, values, with_replay=False, best=True)
+            self._best = self._best if problem else result.mean_return
             self._tell_save(report, metrics, problem)
 
     def _save(self, report: TrainReport, next_evaluation: int, *, with_replay: bool, trained: bool = False) -> str:

@@ -33,10 +33,6 @@ REPORT_S = 1.0
 """Seconds between reports of training."""
 SNAPSHOT_S = 600.0
 """Seconds between snapshots of replay in the background."""
-PRETRAIN_CHUNK = 10
-"""Pre-training steps between reports."""
-PRETRAIN_SAVE_S = 60.0
-"""Seconds between checkpoints of an unfinished pre-training."""
 INCARNATIONS_PER_START = 100_000
 """Incarnations of one start of a run; the next start counts on from a higher number than any before."""
 
@@ -100,6 +96,7 @@ class RayBackend:
             snapshot_s=self._snapshot_s,
             labels=self._labels,
         )
+        self._pool = EvaluationPool(config, self._make_env, self._placement.share_cpus)
         self.action_dim, self.reward_term_names = self._workforce.describe()
         if config.encoder.uses_image and config.encoder.backbone != "random":
             self._learning.call("fetch_weights")
@@ -117,19 +114,7 @@ class RayBackend:
     def pretrain(self, dataset: Path, artifact: Path) -> Iterator[dict[str, float]]:
         """Pre-train in the learner's process, continuing what an interrupted pre-training left."""
         self.enter()
-        learner = self._learning
-        dataset, artifact = dataset.resolve(), artifact.resolve()
-        learner.call("begin_pretraining", dataset, artifact)
-        saved_at, done = time.monotonic(), 0
-        while done < self._config.pretrain.steps:
-            metrics, done = learner.call("pretrain", PRETRAIN_CHUNK)
-            if metrics:
-                yield metrics
-            self._workers.check()
-            if time.monotonic() - saved_at > PRETRAIN_SAVE_S:
-                learner.call("save_pretraining", artifact, finished=False)
-                saved_at = time.monotonic()
-        learner.call("save_pretraining", artifact, finished=True)
+        yield from self._learning.pretrain(dataset.resolve(), artifact.resolve(), self._workers.check)
 
     def begin_training(self, dataset: Path, pretrained: Path | None, resume_from: Path | None) -> dict[str, Any]:
         """Build the learner in its process; replay follows in `train`."""
@@ -175,7 +160,7 @@ class RayBackend:
             status = self._learning.status()
             report = self._report(reporter, status)
             yield report
-            self._close_players()
+            self._players.close()
             counts = self._counts.status()
             workers.adapt(counts, status.metrics.get("learner_wait_s_total", 0.0))
             finished = counts.finished and counts.updates_owed == 0 and status.updates >= counts.updates
@@ -191,20 +176,29 @@ class RayBackend:
         camera = player == "agent" and self._config.encoder.uses_image
         num_workers = len(self._workers.supervisor.handles)
         # While training goes on, its workers keep most of the cores.
-        size = num_workers // 2 if num_workers else self._config.runtime.num_workers
-        pool = self._players(max(1, min(len(seeds), size)))
+        assert self._session is not None, "prepare comes first"
+        room = self._players.room(self._session.available_cpus())
+        size = min(num_workers // 2, room) if num_workers else self._config.runtime.num_workers
+        self._players.grow(max(1, min(len(seeds), size)))
         snapshot = self._acting_weights() if player == "agent" else None
 
+        looked_at = time.monotonic()
+
         def give_up() -> bool:
+            nonlocal looked_at
             self._workers.check()
+            if self._training and time.monotonic() - looked_at >= REPORT_S:
+                self._learning.status()  # which replaces a lost one
+                looked_at = time.monotonic()
             return should_stop()
 
-        yield from pool.play(player, seeds, give_up, camera=camera, setup=self._setup, snapshot=snapshot)
+        yield from self._players.play(player, seeds, give_up, camera=camera, setup=self._setup, snapshot=snapshot)
 
     def record(self, player: Player, seed: int, video: Path, film_strip: Path) -> EpisodeSummary:
         """Play one episode with the camera on and write its video and film strip."""
         snapshot = self._counts.latest(-1) if player == "agent" else None
-        return self._players(1).record(
+        self._players.grow(1)
+        return self._players.record(
             player, seed, video.resolve(), film_strip.resolve(), setup=self._setup, snapshot=snapshot
         )
 
@@ -241,8 +235,9 @@ class RayBackend:
                 steps.callback(_unless_lost, self._learner.close)
             if self._workforce is not None:
                 steps.callback(_unless_lost, self._workforce.close)
-            steps.callback(self._close_players)
-            self._session = self._hub = self._inference = self._learner = self._workforce = None
+            if self._pool is not None:
+                steps.callback(self._pool.close)
+            self._session = self._hub = self._inference = self._learner = self._workforce = self._pool = None
             self._shards = []
 
     def want_workers(self, num_workers: int) -> None:
@@ -262,6 +257,11 @@ class RayBackend:
             ids["inference"] = self._inference.process_id()
         ids["hub"] = self._counts.process_id()
         return ids | self._workers.process_ids()
+
+    @property
+    def _players(self) -> EvaluationPool:
+        assert self._pool is not None, "prepare comes first"
+        return self._pool
 
     @property
     def _workers(self) -> Workforce:
@@ -325,17 +325,6 @@ class RayBackend:
         metrics["worker_cut_episodes_total"] = float(supervisor.num_cut_episodes)
         episodes = tuple(self._counts.take_episodes())
         return TrainReport(env_steps=counts.env_steps, updates=status.updates, metrics=metrics, episodes=episodes)
-
-    def _players(self, size: int) -> EvaluationPool:
-        if self._pool is None or self._pool.size < size:
-            self._close_players()
-            self._pool = EvaluationPool(self._config, self._make_env, self._placement.share_cpus, size)
-        return self._pool
-
-    def _close_players(self) -> None:
-        if self._pool is not None:
-            self._pool.close()
-            self._pool = None
 
 
 def _unless_lost(close: Callable[[], object]) -> None:

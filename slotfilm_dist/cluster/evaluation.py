@@ -39,14 +39,23 @@ class EvaluationPool:
         config: the run.
         make_env: builds an environment.
         share_cpus: cores of each player.
-        size: number of players.
+        size: players from the start.
     """
 
-    def __init__(self, config: RunConfig, make_env: Callable[..., Any], share_cpus: float, size: int) -> None:
+    def __init__(self, config: RunConfig, make_env: Callable[..., Any], share_cpus: float, size: int = 0) -> None:
         self._config, self._make_env, self._share_cpus = config, make_env, share_cpus
         self._num_launched = self._num_lost = 0
         self._under_way: list[_Request] = []
-        self._players = [self._launch() for _ in range(size)]
+        self._players: list[PlayerClient] = []
+        self.grow(size)
+
+    def grow(self, size: int) -> None:
+        """Start players until there are at least so many."""
+        self._players += [self._launch() for _ in range(size - len(self._players))]
+
+    def room(self, free_cpus: float) -> int:
+        """Players that find cores: those that are there, and more on the free ones."""
+        return len(self._players) + int(free_cpus / self._share_cpus + 1e-6)
 
     @property
     def size(self) -> int:
@@ -101,6 +110,10 @@ class EvaluationPool:
                             self._under_way.append(asked)
                             continue
                         error = RoleSilentError(error.name, asked.what, asked.limit_s)
+                        if asked.index < 0 and any(other.index >= 0 for other in self._under_way):
+                            asked.client.kill()  # there is no room for it, and the others play on
+                            self._players.remove(asked.client)
+                            continue
                     if asked.index >= 0:
                         waiting.insert(0, asked.index)
                     self._under_way.append(prepare(self._replace(asked.client, error)))

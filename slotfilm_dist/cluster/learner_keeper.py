@@ -1,7 +1,8 @@
 """The learner's process as the backend needs it: started at the first need, replaced when it is lost."""
 
 import logging
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,10 @@ SILENCE_S = 60.0
 """Time without an answer after which the learner counts as lost."""
 LONG_S = 3600.0
 """Longest wait for what depends on the size of data: reading, encoding, writing."""
+PRETRAIN_CHUNK = 10
+"""Pre-training steps between reports."""
+PRETRAIN_SAVE_S = 60.0
+"""Seconds between checkpoints of an unfinished pre-training."""
 MAX_RESTARTS = 10
 """Losses of the learner before the run is given up."""
 
@@ -54,6 +59,25 @@ class LearnerKeeper:
         """A method of `LearnerRole` that takes its time; the same errors, plus those of a lost process."""
         self._await_start()
         return self._client.call(method, *arguments, timeout_s=timeout_s, **options)
+
+    def pretrain(self, dataset: Path, artifact: Path, check: Callable[[], None]) -> Iterator[dict[str, float]]:
+        """Pre-train, from what was last saved on; the same where the process is lost meanwhile.
+
+        Args:
+            dataset: the random policy's data.
+            artifact: where the result goes.
+            check: raises where the run cannot go on.
+
+        Raises:
+            RunFailedError: the process was lost too often.
+        """
+        while True:
+            try:
+                yield from self._pretrain(dataset, artifact, check)
+            except (RoleLostError, RoleSilentError) as error:
+                self.launch_again(error)
+            else:
+                return
 
     def begin(self, dataset: Path, pretrained: Path | None, resume_from: Path | None) -> LearnerBeginning:
         """Build the agent; a checkpoint that cannot be read, and is passed over, is told.
@@ -101,6 +125,19 @@ class LearnerKeeper:
         finally:
             self._client.kill()
 
+    def _pretrain(self, dataset: Path, artifact: Path, check: Callable[[], None]) -> Iterator[dict[str, float]]:
+        self.call("begin_pretraining", dataset, artifact)
+        saved_at, done = time.monotonic(), 0
+        while done < self._config.pretrain.steps:
+            metrics, done = self.call("pretrain", PRETRAIN_CHUNK)
+            if metrics:
+                yield metrics
+            check()
+            if time.monotonic() - saved_at > PRETRAIN_SAVE_S:
+                self.call("save_pretraining", artifact, finished=False)
+                saved_at = time.monotonic()
+        self.call("save_pretraining", artifact, finished=True)
+
     def _launch(self) -> LearnerClient:
         self._started = False
         threads = self._config.runtime.learner_threads or max(1, int(usable_cores()) // 2)
@@ -142,13 +179,22 @@ class LearnerKeeper:
             except (RoleLostError, RoleSilentError) as again:
                 error = again
 
-    def _replace(self, error: Exception) -> LearnerStatus:
+    def launch_again(self, error: Exception) -> None:
+        """Put a new process in place of one that is lost.
+
+        Raises:
+            RunFailedError: it was lost too often.
+        """
         self.num_restarts += 1
         if self.num_restarts > MAX_RESTARTS:
             raise RunFailedError(f"the learner was lost {self.num_restarts} times, last: {error}; --resume goes on")
-        assert self._make_replay is not None, "start comes first"
+        _logger.warning("the learner's process is replaced: %s", error)
         self._client.kill()
         self._client = self._launch()
+
+    def _replace(self, error: Exception) -> LearnerStatus:
+        assert self._make_replay is not None, "start comes first"
+        self.launch_again(error)
         self._begin(self._folder if any(self._folder.glob("updates-*")) else None)
         status = self._client.status()
         # What was granted and is lost with the process is due again.

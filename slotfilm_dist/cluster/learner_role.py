@@ -174,7 +174,9 @@ class LearnerRole:
         Raises:
             OSError: it could not be written.
         """
-        if best and self._candidate is not None:
+        if best:
+            if self._candidate is None:
+                raise OSError("the learner that was evaluated has been lost since")
             checkpoint = dataclasses.replace(self._candidate, values={**self._candidate.values, **values})
         else:
             with self._between_updates:

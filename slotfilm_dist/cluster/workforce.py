@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from slotfilm_dist.backend import RunFailedError
+from slotfilm_dist.cluster.clients import is_ready
 from slotfilm_dist.cluster.failures import RoleLostError, RoleSilentError
 from slotfilm_dist.cluster.hub_client import HubClient
 from slotfilm_dist.cluster.inference_client import InferenceClient
@@ -216,6 +217,7 @@ class Workforce:
         """The caretaker's loop: consumes beats, produces restarts and snapshots; ends with `close` or a failure."""
         snapshot_s = self._snapshot_s if self._config.checkpoint.save_replay else math.inf
         next_snapshot = time.monotonic() + snapshot_s
+        snapshots: dict[int, Any] = {}
         while not self._closing.wait(TICK_S):
             try:
                 self.supervisor.tick()
@@ -225,7 +227,9 @@ class Workforce:
                     self.watch.tick()
                     if time.monotonic() >= next_snapshot:
                         for shard in self._shards:
-                            shard.begin_snapshot()
+                            last = snapshots.get(shard.index)
+                            if last is None or is_ready(last):  # else it is still being written
+                                snapshots[shard.index] = shard.begin_snapshot()
                         next_snapshot = time.monotonic() + snapshot_s
             except RunFailedError as error:
                 self._failure = error

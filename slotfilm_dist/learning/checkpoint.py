@@ -141,6 +141,13 @@ class CheckpointStore:
         """Replace `best`; gives its size in bytes."""
         return write_checkpoint(self.folder / "best", checkpoint)
 
+    def best_values(self) -> dict[str, Any]:
+        """The plain values of `best`; empty where there is none that can be used."""
+        try:
+            return _read_manifest(self.folder / "best" / MANIFEST)["values"]
+        except (ValueError, OSError):
+            return {}
+
     def read_last(self, config_hash: str, *, strict: bool = False) -> tuple[Checkpoint, list[str]] | None:
         """The newest readable checkpoint and what was wrong with newer ones; None if there is none at all.
 

@@ -1,5 +1,6 @@
 """Players that hang or are in nobody's way, without Ray."""
 
+import time
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
@@ -74,3 +75,26 @@ def test_stop_ends_the_episodes_under_way(pool: EvaluationPool, monkeypatch: pyt
     asked = iter([False] * 5 + [True])
     assert play(pool, lambda: next(asked)) == []
     assert (pool.size, Player.num_killed) == (0, 2)
+
+
+def test_player_that_finds_no_core_is_left_out_while_another_plays(
+    pool: EvaluationPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_room = pool._players[0]
+    begin = Player.begin_prepare
+    monkeypatch.setattr(Player, "begin_prepare", lambda self, *a: -1 if self is without_room else begin(self, *a))
+    monkeypatch.setattr(evaluation, "EPISODE_S", 60.0)
+    answer, until = Player.answer, time.monotonic() + 0.5
+
+    def slowly(self: Player, request: Any, waiting_for: str, timeout_s: float) -> Any:
+        if request in SEEDS and time.monotonic() < until:
+            raise RoleSilentError("player", waiting_for, timeout_s)
+        return answer(self, request, waiting_for, timeout_s)
+
+    monkeypatch.setattr(Player, "answer", slowly)
+    assert play(pool) == [f"episode {seed}" for seed in SEEDS]
+    assert (pool.size, Player.num_killed) == (1, 1)
+
+
+def test_room_counts_the_players_that_have_cores_already(pool: EvaluationPool) -> None:
+    assert (pool.room(0.0), pool.room(1.5)) == (2, 3)

@@ -118,3 +118,27 @@ def test_run_is_given_up_after_too_many_losses(keeper: LearnerKeeper) -> None:
     with pytest.raises(RunFailedError, match=rf"the learner was lost {MAX_RESTARTS + 1} times, .*--resume goes on"):
         keeper.status()
     assert len(Process.launched) == MAX_RESTARTS + 1
+
+
+def test_learner_that_is_lost_while_it_pretrains_goes_on_from_what_was_saved(
+    keeper: LearnerKeeper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done, lost_at = [0], [10]
+
+    def call(process: Process, method: str, *arguments: Any, timeout_s: float, **options: Any) -> Any:
+        process.calls.append(method)
+        if method == "pretrain":
+            if done[0] in lost_at:
+                lost_at.clear()
+                raise LOST
+            done[0] += arguments[0]
+            return {"pretrain_steps_total": float(done[0])}, done[0]
+        return None
+
+    monkeypatch.setattr(Process, "call", call)
+    seen = list(keeper.pretrain(tmp_path / "data", tmp_path / "encoder", lambda: None))
+    assert [metrics["pretrain_steps_total"] for metrics in seen] == [10.0, 20.0]
+    first, second = Process.launched
+    assert first.killed
+    assert second.calls[0] == "begin_pretraining"
+    assert second.calls[-1] == "save_pretraining"
