@@ -110,9 +110,7 @@ class EvaluationPool:
                             self._under_way.append(asked)
                             continue
                         error = RoleSilentError(error.name, asked.what, asked.limit_s)
-                        if asked.index < 0 and any(other.index >= 0 for other in self._under_way):
-                            asked.client.kill()  # there is no room for it, and the others play on
-                            self._players.remove(asked.client)
+                        if self._left_out(asked):
                             continue
                     if asked.index >= 0:
                         waiting.insert(0, asked.index)
@@ -152,6 +150,14 @@ class EvaluationPool:
     def _launch(self) -> PlayerClient:
         self._num_launched += 1
         return PlayerClient.launch(self._config, self._num_launched, self._make_env, self._share_cpus)
+
+    def _left_out(self, asked: _Request) -> bool:
+        """A player that has not begun while another plays finds no core; it goes, and counts for nothing."""
+        if asked.index >= 0 or not any(other.index >= 0 for other in self._under_way):
+            return False
+        asked.client.kill()
+        self._players.remove(asked.client)
+        return True
 
     def _replace(self, client: PlayerClient, error: Exception) -> PlayerClient:
         client.kill()

@@ -255,3 +255,14 @@ def test_passed_over_checkpoint_is_named_to_who_begins(bench: Bench) -> None:
     assert bench.hub.newest_version() > version
     found = CheckpointStore(bench.checkpoints, 2).read_last(learning_hash(bench.config))
     assert found is not None
+
+
+def test_learner_that_never_began_stops_too(tmp_path: Path) -> None:
+    hub = Hub(build_limiter(1.0, STEPS, 16), 1_000, 1)
+    assert LearnerRole(smoke(), 7, torch.device("cpu"), hub).stop(1.0) == 0
+
+
+def test_best_is_the_learner_that_was_judged_or_nothing(tmp_path: Path) -> None:
+    hub = Hub(build_limiter(1.0, STEPS, 16), 1_000, 1)
+    with pytest.raises(OSError, match="the learner that was evaluated has been lost since"):
+        LearnerRole(smoke(), 7, torch.device("cpu"), hub).save(tmp_path, {}, best=True)
