@@ -48,6 +48,8 @@ PRETRAIN_SAVE_S = 60.0
 """Seconds between checkpoints of an unfinished pre-training."""
 REPORT_S = 1.0
 """Seconds between reports of training."""
+STOP_PATIENCE_S = 20.0
+"""How long a stop waits for the end of the episode; where a resume has to be exact, as long as it takes."""
 
 _logger = logging.getLogger(__name__)
 
@@ -213,10 +215,10 @@ class LocalBackend:
         return int(checkpoint.values["limiter"]["env_steps"])
 
     def train(self, should_stop: Callable[[], bool], is_due: IsDue = never_due) -> Iterator[TrainReport]:
-        """Collect and update in turn until the schedule's end; a stop takes effect where an episode ends."""
+        """Collect and update in turn until the schedule's end; a stop waits for an end of the episode that is near."""
         config, learner, limiter = self._config, self._trained(), self._limiter
         episodes: list[TrainingEpisode] = []
-        reported = time.monotonic()
+        reported, patient_until = time.monotonic(), math.inf
         began_steps, began_updates = limiter.env_steps, learner.updates
         while (left := config.schedule.total_steps - limiter.env_steps) > 0 or limiter.updates_owed():
             if limiter.updates_owed():  # also those that a return to a checkpoint has lost
@@ -241,8 +243,11 @@ class LocalBackend:
                 yield self._report(metrics, episodes, settled)
                 episodes = []
                 reported, began_steps, began_updates = time.monotonic(), limiter.env_steps, learner.updates
-            if settled and should_stop():
-                break
+            if should_stop():
+                patience_s = math.inf if config.runtime.exact_resume else STOP_PATIENCE_S
+                patient_until = min(patient_until, time.monotonic() + patience_s)
+                if settled or time.monotonic() >= patient_until:
+                    break
         yield self._report(self._metrics(), episodes, True)
 
     def _collect(self, num_steps: int) -> TransitionBlock:
@@ -338,10 +343,5 @@ class LocalBackend:
         return self._learner
 
     def _report(self, metrics: Mapping[str, float], episodes: list[TrainingEpisode], settled: bool) -> TrainReport:
-        return TrainReport(
-            env_steps=self._limiter.env_steps,
-            updates=self._trained().updates,
-            metrics=metrics,
-            episodes=tuple(episodes),
-            settled=settled,
-        )
+        place = {"env_steps": self._limiter.env_steps, "updates": self._trained().updates}
+        return TrainReport(**place, metrics=metrics, episodes=tuple(episodes), settled=settled)

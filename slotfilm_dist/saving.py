@@ -11,6 +11,8 @@ MAX_FAILED = 5
 """Checkpoints in a row that may fail; after so many a run that cannot keep what it learns stops."""
 RETRY_S = 10.0
 """Pause before a checkpoint that failed is tried again."""
+LONGEST_S = 1800.0
+"""Longest time between checkpoints while updates are made, however few they are."""
 PAUSES_GROW = 4.0
 """Factor from one such pause to the next: the last try comes a quarter of an hour after the first."""
 
@@ -43,7 +45,9 @@ class Saver:
 
     def due(self, updates: int) -> bool:
         """Whether one should be written after so many updates."""
-        return updates >= self._next and time.monotonic() >= self._retry_at
+        now = time.monotonic()
+        late = updates > self._saved_updates and now - self._saved_at >= LONGEST_S
+        return (updates >= self._next or late) and now >= self._retry_at
 
     def age(self, report: TrainReport) -> dict[str, float]:
         """How old the last one is, as metrics."""

@@ -162,6 +162,20 @@ def test_reports_come_where_something_is_due_and_episodes_carry_their_own_step_w
     assert steps == sorted(set(steps)), "one episode ends at a time"
 
 
+def test_stop_does_not_wait_for_ever_for_the_end_of_a_slow_episode(
+    local: RunConfig, make_dataset: MakeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("slotfilm_dist.local.STOP_PATIENCE_S", 0.0)
+    first = begun(local, make_dataset(local), tmp_path / "switches")
+    (stopped,) = first.train(lambda: first._limiter.updates_owed() > 0)
+    assert first._limiter.updates_owed() > 0, "in the middle of things"
+    first.save(tmp_path / "checkpoints", {}, with_replay=True)
+    again = begun(local, make_dataset(local), tmp_path / "switches", tmp_path / "checkpoints")
+    report = last_report(again)
+    assert stopped.env_steps < report.env_steps == 600
+    assert report.updates == 200
+
+
 def test_ratio_of_one_update_for_many_steps_is_kept(
     local: RunConfig, make_dataset: MakeDataset, tmp_path: Path
 ) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from slotfilm_dist.backend import RunFailedError, TrainReport
-from slotfilm_dist.saving import MAX_FAILED, Saver
+from slotfilm_dist.saving import LONGEST_S, MAX_FAILED, Saver
 
 
 class FullDisk:
@@ -41,6 +41,17 @@ def test_checkpoint_is_due_every_so_many_updates() -> None:
     assert not made.due(219)
     assert made.due(220)
     assert made.age(report(150))["checkpoint_age_updates"] == 30
+
+
+def test_checkpoint_is_due_after_a_while_however_few_the_updates_were(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [1000.0]
+    monkeypatch.setattr("slotfilm_dist.saving.time.monotonic", lambda: now[0])
+    made = saver(FullDisk(0))
+    now[0] += LONGEST_S
+    assert not made.due(0), "nothing is new"
+    assert made.due(1)
+    made.save(report(1), {}, with_replay=False)
+    assert not made.due(2)
 
 
 def test_failed_checkpoint_is_told_counted_and_not_tried_again_at_once() -> None:
