@@ -84,7 +84,7 @@ _RUN = (
     _gauge("updates", "updates", "Optimiser updates of the run."),
     _gauge("phase", "1", "Phase of the run: 0 collect, 1 pretrain, 2 train, 3 evaluate."),
     _gauge("run_eta_s", "s", "Estimated time to the end of the run."),
-    _gauge("run_memory_bytes", "bytes", "Resident memory of the driver and its children: no roles of a joined cluster."),
+    _gauge("run_memory_bytes", "bytes", "Resident memory of driver and children: no roles of a joined cluster."),
     _gauge("run_gpu_memory_bytes", "bytes", "GPU memory that the learner has allocated."),
     _gauge("run_disk_free_bytes", "bytes", "Free space where the run is written."),
 )
