@@ -15,6 +15,7 @@ import sys
 from pathlib import Path
 
 from slotfilm_dist.__main__ import main
+from slotfilm_dist.commands.evaluate import EPISODES
 
 STOPPED = 128
 """Exit codes from here on mean that a signal has ended it."""
@@ -30,16 +31,17 @@ def is_there(run: Path, episodes: int, seed: int) -> bool:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path, help="directories of runs")
-    parser.add_argument("--episodes", type=int, default=50)
+    parser.add_argument("--episodes", type=int, help="of each run (default: as `slotfilm evaluate` has it)")
     parser.add_argument("--seed", type=int, default=10_000_000)
     options, rest = parser.parse_known_args()
     code = 0
     for run in options.runs:
-        if not rest and is_there(run, options.episodes, options.seed):
+        if not rest and is_there(run, options.episodes or EPISODES, options.seed):
             print(f"{run}: evaluated already")
             continue
         print(f"{run}:", flush=True)
-        words = [str(run), "--episodes", str(options.episodes), "--seed", str(options.seed), *rest]
+        episodes = [] if options.episodes is None else ["--episodes", str(options.episodes)]
+        words = [str(run), *episodes, "--seed", str(options.seed), *rest]
         ended = main(["evaluate", *words])
         if ended >= STOPPED:
             sys.exit(ended)

@@ -15,8 +15,10 @@ import argparse
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 from slotfilm_dist.__main__ import main
+from slotfilm_dist.runs import RUN_NAME
 
 
 def words(arguments: list[str]) -> list[str]:
@@ -33,8 +35,14 @@ def words(arguments: list[str]) -> list[str]:
         if not Path(path).is_absolute():
             parser.error(f"{path} is relative: Ray deletes a job's working directory; give a path that every node sees")
     given = [options.preset, *filter(None, [options.variant]), f"s{options.seed}"]
+    if options.name and not RUN_NAME.fullmatch(options.name):
+        parser.error(f"--name {options.name!r}: use letters, digits, '.', '_' and '-', at most 100 of them")
     run = Path(options.runs) / (options.name or "-".join(given))
-    if _phase(run / "status.json") == "done":
+    begun = _read(run / "config.json")
+    for name, wanted in (("seed", options.seed), ("variant", options.variant or "slotfilm")):
+        if str(begun.get(name, wanted)) != wanted:
+            parser.error(f"--{name} {wanted}: {run} was begun with {name} {begun[name]}; give this run another --name")
+    if _read(run / "status.json").get("phase") == "done":
         print(f"{run} is done; see {run / 'report.html'}")
         return []
     places = ["--artifacts", options.artifacts]
@@ -45,14 +53,16 @@ def words(arguments: list[str]) -> list[str]:
     return [*begin, *places, *rest]
 
 
-def _phase(status: Path) -> str:
-    """How far the run has come; empty where that cannot be read: `train` then looks itself."""
+def _read(path: Path) -> dict[str, Any]:
+    """A JSON object of the run; empty where it cannot be read: `train` then looks itself."""
     try:
-        return str(json.loads(status.read_text(encoding="utf-8")).get("phase", ""))
-    except (OSError, ValueError, AttributeError):
-        return ""
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return values if isinstance(values, dict) else {}
 
 
 if __name__ == "__main__":
     command = words(sys.argv[1:])
+    sys.argv[1:] = command  # what the run records as its command
     sys.exit(main(command) if command else 0)

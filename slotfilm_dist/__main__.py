@@ -1,6 +1,7 @@
 """The command line: `slotfilm COMMAND`, also `python -m slotfilm_dist COMMAND`."""
 
 import importlib
+import itertools
 import os
 import sys
 import traceback
@@ -42,6 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"slotfilm {__version__}")
         return 0
     try:
+        _refuse_empty(words)
         return _command(words[0])(words[1:])
     except ValueError as error:
         if debug:
@@ -59,6 +61,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("slotfilm: stopped", file=sys.stderr)
         return 130
+
+
+def _refuse_empty(words: Sequence[str]) -> None:
+    """A word that is empty stands for a variable that was not set; to go on would do something else than was meant."""
+    for before, word in itertools.pairwise(("", *words)):
+        if word == "" or (word.startswith("--") and word.endswith("=")):
+            what = word.removesuffix("=") or (before if before.startswith("--") else "a word")
+            raise ValueError(f"{what}: its value is missing; was it an empty variable?")
 
 
 def _command(name: str) -> Callable[[Sequence[str]], int]:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Literal
 
-from slotfilm_dist.config import PROPRIO_FIELDS, LrConfig, RunConfig
+from slotfilm_dist.config import PROPRIO_FIELDS, DdpgConfig, LrConfig, RunConfig
 from slotfilm_dist.config_files import changed_fields
 
 Variant = Callable[[RunConfig], RunConfig]
@@ -66,10 +66,12 @@ def drqv2(base: RunConfig) -> RunConfig:
     pixels, schedule = _on_pixels(base, "drqv2", DRQ_FEATURES), base.schedule
     learning_steps = schedule.total_steps - schedule.random_steps
     total_steps = max(schedule.total_steps * 2 // 3, schedule.random_steps + max(1, learning_steps * 7 // 11))
+    # 800k of 1.2 M steps are 2/3 of all and 7/11 of the learning. The noise falls until step 500k, 4/7 of that.
+    std_steps = schedule.random_steps + (total_steps - schedule.random_steps) * 4 // 7
+    chosen = base.ddpg.std_steps != DdpgConfig().std_steps
     return replace(
         pixels,
-        # 800k of 1.2 M steps are 2/3 of all and 7/11 of the learning. The noise falls until step 500k, 4/7 of that.
-        ddpg=replace(base.ddpg, std_steps=schedule.random_steps + (total_steps - schedule.random_steps) * 4 // 7),
+        ddpg=base.ddpg if chosen else replace(base.ddpg, std_steps=std_steps),
         sac=replace(base.sac, batch_size=2 * base.sac.batch_size),
         schedule=replace(schedule, total_steps=total_steps, updates_per_step=schedule.updates_per_step / 2),
     )

@@ -17,6 +17,8 @@ from slotfilm_dist.commands.options import (
 )
 from slotfilm_dist.config_files import load_config
 
+EPISODES = 50
+"""Plain episodes, unless `--episodes` says otherwise."""
 PARTS: dict[str, set[str]] = {
     "policy": {"policy", "episodes"},
     "perception": {"episodes", "steps", "frames", "checkpoint"},
@@ -33,7 +35,7 @@ def main(arguments: Sequence[str]) -> int:
     options, fields = parse_with_fields(parser, arguments)
     if options.episodes is not None and options.episodes < 1:
         raise ValueError(f"--episodes {options.episodes}: must be 1 or more")
-    episode_seeds(options.seed, options.episodes or 50)
+    episode_seeds(options.seed, options.episodes or EPISODES)
     for name in sorted(set().union(*PARTS.values()) - PARTS[options.what]):
         if getattr(options, name) != parser.get_default(name):
             raise ValueError(f"--{name}: --what {options.what} does not read it; leave it away")
@@ -103,7 +105,7 @@ def _parser() -> Parser:
 
 def _play(options: argparse.Namespace, fields: Sequence[str]) -> int:
     """Episodes of a policy: return and success."""
-    num_episodes = options.episodes or 50
+    num_episodes = options.episodes or EPISODES
     seeds = episode_seeds(options.seed, num_episodes)
     player = options.policy or ("agent" if options.run else "")
     if not player or (player == "agent" and not options.run):

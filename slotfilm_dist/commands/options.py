@@ -69,9 +69,7 @@ def _is_number(word: str) -> bool:
 
 def add_config_options(parser: argparse.ArgumentParser, preset: str) -> None:
     """Preset, variant, seed and the note on fields."""
-    parser.add_argument(
-        "preset", nargs="?", default=preset, help=f"budget: {', '.join(PRESETS)} (default: %(default)s)"
-    )
+    parser.add_argument("preset", nargs="?", default=preset, help=f"budget: {', '.join(PRESETS)} (default: {preset})")
     parser.add_argument("--variant", default="", help=f"agent: {', '.join(VARIANTS)} (default: slotfilm)")
     parser.add_argument("--fields", action="store_true", help="list every field of the config with its default")
     parser.epilog = FIELDS_NOTE
@@ -111,8 +109,11 @@ def build_config(preset: str, variant: str, fields: Sequence[str], *, show_field
     plain = apply_variant(variant or base.variant, base)
     if show_fields:
         change_fields(plain, ["--help"])
-    changed = change_fields(base, fields)
-    config = apply_variant(plain.variant, changed)
+    try:
+        changed = change_fields(base, fields)
+        config = apply_variant(plain.variant, changed)
+    except ValueError:  # what the proposed agent cannot have the variant may: views of a picture, its own width
+        changed = config = change_fields(plain, fields)
     check_effects(fields, plain, changed, config)
     return config
 
@@ -155,7 +156,7 @@ def _refusal(fields: Sequence[str], shown: str) -> str:
     known = _field_names(RunConfig(), "")
     for field in fields:
         name = field.removeprefix("--").split("=")[0].replace("-", "_")
-        if field.startswith("--") and name not in known:
+        if field.startswith("--") and name.replace(".no_", ".") not in known:
             near = difflib.get_close_matches(name, known, n=1)
             return f"unknown field --{name}" + (f"; did you mean --{near[0]}?" if near else "; --fields lists them all")
     lines = [line.strip(" |│╭╮╰╯─\n") for line in shown.splitlines()]

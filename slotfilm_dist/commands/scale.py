@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import os
 import sys
 import time
@@ -43,8 +44,8 @@ def main(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
     options = parser.parse_args(arguments)
-    if options.timeout_s < 0:
-        raise ValueError(f"--timeout-s {options.timeout_s:g}: must be 0 or more")
+    if not 0 <= options.timeout_s < math.inf:
+        raise ValueError(f"--timeout-s {options.timeout_s:g}: must be 0 or more, and finite")
 
     _present_token(Path(options.run))
     from slotfilm_dist.cluster.hub_client import HubClient

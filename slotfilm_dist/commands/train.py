@@ -62,6 +62,10 @@ def main(arguments: Sequence[str]) -> int:
         preset = options.preset or DEFAULT_PRESET
         config = with_weights_file(build_config(preset, options.variant, fields, show_fields=options.fields))
         path = new_run_directory(Path(options.runs or "runs"), config, preset, options.name)
+    if config.runtime.mode == "local" and options.workers is not None:
+        raise ValueError("--workers: one process has no workers; leave it away, or take --runtime.mode ray")
+    if config.runtime.mode == "ray" and config.runtime.exact_resume:
+        raise ValueError("runtime.exact_resume = True: holds in one process alone; add --runtime.mode local")
     return _execute(path, config, Path(options.artifacts), as_json=options.json)
 
 

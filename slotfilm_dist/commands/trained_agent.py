@@ -99,11 +99,11 @@ def _read(run_dir: Path, config: RunConfig, which: Which, artifacts: Path) -> Ch
         if not (folder / "best").exists():
             raise ValueError(
                 f"{folder / 'best'} does not exist: it is written by evaluations during training "
-                "(evaluation.every_steps); use --checkpoint last"
+                "(evaluation.every_steps); use the newest one, last"
             )
         return read_checkpoint(folder / "best", learning_hash(config))
     if not config.pretrains:
-        raise ValueError(f"{run_dir}: variant {config.variant!r} has no pre-training; use --checkpoint last")
+        raise ValueError(f"{run_dir}: variant {config.variant!r} has no pre-training; use the newest checkpoint, last")
     return read_checkpoint(artifacts / f"encoder-{pretrain_hash(config)}")
 
 

@@ -77,8 +77,8 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--once", action="store_true", help="show the present values and leave")
     parser.add_argument("--json", action="store_true", help="print the present values as one JSON object and leave")
     options = parser.parse_args(arguments)
-    if not options.every >= 0.01:
-        raise ValueError(f"--every {options.every:g}: must be 0.01 s or more")
+    if not 0.01 <= options.every <= 86_400:
+        raise ValueError(f"--every {options.every:g}: must be 0.01 s or more, and a day at the most")
     run = Path(options.run)
     if not (run / "config.json").exists():
         raise ValueError(f"{run} is no directory of a run: it has no config.json")

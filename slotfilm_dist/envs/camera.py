@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from slotfilm_dist.config import EnvConfig
+from slotfilm_dist.config import EnvConfig, check
 from slotfilm_dist.envs.render_profile import apply_render_profile
 
 # Software rendering of one small picture is fastest in the caller's own thread; Mesa reads this when it starts.
@@ -21,10 +21,14 @@ CAMERA_LINK = "camera_link"
 
 
 def render_device(backend: str) -> str:
-    """ManiSkill's name of the device that renders; `auto` is a GPU where torch finds one, else the CPU."""
-    if backend == "auto":
-        return "gpu" if torch.cuda.is_available() else "cpu"
-    return backend
+    """ManiSkill's name of the device that renders; `auto` is a GPU where torch finds one, else the CPU.
+
+    Raises:
+        ValueError: a GPU is asked for and there is none; ManiSkill would go on in software.
+    """
+    there = torch.cuda.is_available()
+    check(backend != "gpu" or there, "env.render_backend", backend, "torch finds no GPU here; use cpu or auto")
+    return ("gpu" if there else "cpu") if backend == "auto" else backend
 
 
 class WristCamera:

@@ -97,8 +97,8 @@ def job_resources(
         ValueError: a number that cannot be asked for.
     """
     for option, value in (("--cpus-per-trial", cpus_per_trial), ("--gpus-per-trial", gpus_per_trial)):
-        if value is not None and not (value > 0 or (value == 0 and option == "--gpus-per-trial")):
-            raise ValueError(f"{option} {value:g}: must be greater than 0")
+        if value is not None and not (0 < value < math.inf or (value == 0 and option == "--gpus-per-trial")):
+            raise ValueError(f"{option} {value:g}: must be greater than 0 and finite")
     if gpus_per_trial is not None and gpus_per_trial > 1:
         raise ValueError(f"--gpus-per-trial {gpus_per_trial:g}: a trial has one learner, which uses at most 1 GPU")
     config = job.config

@@ -65,6 +65,16 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (("train", "--variant", "drqv2", "--lr.actor", "1e-3"), "its own fields are --ddpg.*"),
         (("train", *ON_STACKCUBE, "--variant", "alpha_5"), "StackCube-v1 brings its own reward; take another variant"),
         (("train", *ON_STACKCUBE, "--env.goal_visible"), "--env.goal_visible: StackCube-v1 brings its own reward and"),
+        (("train", "quick", "--runtime.mode", "local", "--workers", "2"), "one process has no workers"),
+        (("train", "quick", "--runtime.exact_resume"), "add --runtime.mode local"),
+        (("train", "--variant", ""), "--variant: its value is missing; was it an empty variable"),
+        (("train", "quick", "--variant="), "--variant: its value is missing; was it an empty variable"),
+        (("report", ""), "was it an empty variable"),
+        (("train", "quick", "--workers", "3", "--sac.gamma", "2"), "sac.gamma = 2.0"),
+        (("train", "quick", "--checkpoint.no_save_replay", "--env.max_steps", "0"), "env.max_steps = 0"),
+        (("grid", "quick", "--cpus-per-trial", "inf", "--dry-run"), "--cpus-per-trial inf: must be greater than 0"),
+        (("watch", "run", "--every", "inf"), "--every inf"),
+        (("scale", "run", "--workers", "2", "--timeout-s", "nan"), "--timeout-s nan"),
         (("train", "--obs.num_objects", "1"), "obs.num_objects = 1: PickBanana-v1 has 2"),
         (
             ("train", "quick", "--encoder.goal_out_of_view_bias", "10"),
@@ -202,3 +212,9 @@ def test_train_makes_of_variant_and_fields_what_a_grid_makes_of_them(variant: st
     assert build_config("laptop", variant, fields) == expected
     if variant == "drqv2":
         assert expected.ddpg.std_steps < expected.schedule.total_steps < 50_000, "noise and budget are scaled"
+
+
+def test_what_only_a_variant_can_have_can_be_changed_with_it() -> None:
+    assert build_config("quick", "drq", ("--sac.augment_views", "4")).sac.augment_views == 4
+    assert build_config("quick", "cnn", ("--encoder.feature_dim", "64")).encoder.feature_dim == 64
+    assert build_config("quick", "drqv2", ("--ddpg.std_steps", "9999")).ddpg.std_steps == 9999

@@ -75,3 +75,20 @@ def test_every_job_says_how_it_is_submitted(name: str) -> None:
     doc = job(name).__doc__ or ""
     assert f"python jobs/{name}.py" in doc
     assert "ray job submit --working-dir ." in doc
+
+
+def test_paper_does_not_go_on_with_another_run_under_its_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "runs" / "mine"
+    run.mkdir(parents=True)
+    (run / "config.json").write_text(json.dumps({"seed": 0, "variant": "slotfilm"}))
+    given = ["--runs", str(run.parent), "--artifacts", str(tmp_path / "a"), "--name", "mine"]
+    words = job("paper").words
+    assert words(given)[:2] == ["train", "--resume"]
+    for other, told in ((["--seed", "7"], "begun with seed 0"), (["--variant", "cnn"], "begun with variant slotfilm")):
+        with pytest.raises(SystemExit):
+            words([*given, *other])
+        assert told in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        words([*given[:4], "--name", "../mine"])
