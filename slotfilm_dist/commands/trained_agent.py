@@ -99,7 +99,7 @@ def _read(run_dir: Path, config: RunConfig, which: Which, artifacts: Path) -> Ch
         if not (folder / "best").exists():
             raise ValueError(
                 f"{folder / 'best'} does not exist: it is written by evaluations during training "
-                "(evaluation.every_steps); use the newest one, last"
+                "(evaluation.every_steps); use the newest checkpoint, last"
             )
         return read_checkpoint(folder / "best", learning_hash(config))
     if not config.pretrains:

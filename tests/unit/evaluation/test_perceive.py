@@ -268,7 +268,7 @@ def test_broken_stream_keeps_what_was_seen_and_says_why(
         ((), "nothing to do"),
         (("--out", "o.png", "--timeout", "0"), "--timeout"),
         (("--out", "o.png", "--max-frames", "0"), "--max-frames 0"),
-        (("--out", "o.png", "--which", "best"), "use --checkpoint last"),
+        (("--out", "o.png", "--which", "best"), "use the newest checkpoint, last"),
         (("--out", "o.png", "--which", "pretrained", "--artifacts", "none"), "encoder-"),
     ],
 )
